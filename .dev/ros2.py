@@ -15,8 +15,7 @@ from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 import yaml
 
-from uwb_tdoa_bias.common.errors import Failure
-from uwb_tdoa_bias.common.text import printable
+from uwb_tdoa_bias.common.errors import Failure, printable
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.live.session import Recorder, message_class, session, subscription_qos

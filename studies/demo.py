@@ -6,7 +6,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 import time
 
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.report.entries import entries

@@ -31,7 +31,7 @@ from uwb_tdoa_bias.common.flight import Flight, Tdoas
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
 from uwb_tdoa_bias.common.survey import NamedAnchors, read_named_anchors
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf import launching
 from uwb_tdoa_ekf.core.config import FilterConfig

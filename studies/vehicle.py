@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.core.config import FilterConfig

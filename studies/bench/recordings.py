@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_bias.correction.network import Network
+    from uwb_tdoa_bias.correction.model import Network
 
 SECONDS = 45.0
 TARGET, TARGET_CORRECTED = 0.1, 0.2  # s for such a flight, without and with corrections

@@ -9,10 +9,9 @@ from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty, survey_fault
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.survey import read_survey
-from uwb_tdoa_bias.common.survey_faults import refuse_faulty, survey_fault
 
 # --- anchors ---
 

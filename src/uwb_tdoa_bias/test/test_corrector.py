@@ -23,7 +23,7 @@ from uwb_tdoa_bias.correction.corrector import (
     rotated_in_yaw,
     warm_up,
 )
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])

@@ -20,7 +20,7 @@ import yaml
 
 from uwb_tdoa_bias.common import files
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import YAML_BYTES, InputError, printable, sanitize
 from uwb_tdoa_bias.common.files import (
     protected_inputs,
     read_arrays,
@@ -32,9 +32,7 @@ from uwb_tdoa_bias.common.files import (
 )
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.flyable import FlyableVolume
-from uwb_tdoa_bias.common.limits import YAML_BYTES
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml, read_yaml
-from uwb_tdoa_bias.common.text import printable, sanitize
 
 # --- files ---
 

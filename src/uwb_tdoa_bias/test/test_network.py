@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.correction.network import Network, load_network
+from uwb_tdoa_bias.correction.model import Network, load_network
 from uwb_tdoa_bias.effects import Samples
 
 known_answer = pytest.importorskip("known_answer")

@@ -10,10 +10,9 @@ import numpy as np
 from programs import python
 import pytest
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.limits import MODEL_BYTES, MODEL_SECONDS
+from uwb_tdoa_bias.common.errors import MODEL_BYTES, MODEL_SECONDS, InputError
 from uwb_tdoa_bias.correction import trial
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402

@@ -25,8 +25,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import FluidPressure
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.limits import LINE_LENGTH
+from uwb_tdoa_bias.common.errors import LINE_LENGTH, InputError
 from uwb_tdoa_bias.ros import node as served, parameters
 from uwb_tdoa_bias.ros.anchors import (
     ANCHORS_QOS,

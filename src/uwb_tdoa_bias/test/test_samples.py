@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.vibration import (
     track_vibration,
 )
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.features import ATTITUDE, FEATURES, NAMES, columns, everything
+from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, NAMES, columns, everything
 from uwb_tdoa_bias.effects import EffectSet, Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import covariate_of
 from uwb_tdoa_bias.effects.samples import Motion, motion_at, preceding

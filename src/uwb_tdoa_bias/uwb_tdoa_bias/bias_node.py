@@ -36,8 +36,7 @@ from .correction.corrector import (
     parts_of,
     warm_up,
 )
-from .correction.model import EFFECTS, FADED, NETWORK, PASSED
-from .correction.network import load_network
+from .correction.model import EFFECTS, FADED, NETWORK, PASSED, load_network
 from .effects import EffectSet, LabelEffect
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm

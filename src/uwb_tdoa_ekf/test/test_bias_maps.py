@@ -13,9 +13,16 @@ from scipy.stats import norm
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_ekf.debias import BiasMap, Part, fit
-from uwb_tdoa_ekf.debias.bias_map import FADE, AngularNetwork
-from uwb_tdoa_ekf.debias.fit import Markers, collect, corrected_bias
+from uwb_tdoa_ekf.debias import (
+    FADE,
+    AngularNetwork,
+    BiasMap,
+    Markers,
+    Part,
+    collect,
+    corrected_bias,
+    fit,
+)
 
 STEP = 0.5
 

@@ -28,7 +28,7 @@ from scipy.stats import chi2
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.corrector import Corrector, known_yaw_std
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.pair import PairOffset
 from uwb_tdoa_ekf.core import memory

@@ -9,9 +9,8 @@ from flights import corners
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import UNITS, Anchors
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.common.survey_faults import UNITS
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight

@@ -40,7 +40,7 @@ from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD, Corrector
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.sensor import AccelBias
 from uwb_tdoa_bias.effects.tag import TagLeverArm

@@ -14,7 +14,7 @@ from programs import run
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.correction.features import FEATURES
+from uwb_tdoa_bias.correction.model import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_tools.exporting.c_code import MEMBERS, Dense

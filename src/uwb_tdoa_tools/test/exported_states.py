@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.correction.features import FEATURES
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.correction.session import Session
 from uwb_tdoa_bias.effects import EFFECTS, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_TDOA

@@ -18,14 +18,15 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import evaluate as evaluate_command
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.scoring.alignment import (
+from uwb_tdoa_tools.scoring.evaluation import (
     _other_axes,
+    align_truth,
     estimate_alignment,
+    on_one_clock,
     require_truth,
     rigid_transform,
     transform_truth,
 )
-from uwb_tdoa_tools.scoring.evaluation import align_truth, on_one_clock
 
 EPOCH = 1.7e9 - 12.3
 TURN = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()

@@ -15,11 +15,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, survey_fault
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
-from uwb_tdoa_bias.common.survey_faults import survey_fault
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
 from uwb_tdoa_tools.bags.messages import typestore

@@ -16,11 +16,11 @@ from recordings import ANCHORS, small_flight
 from rosbags.rosbag2 import Writer
 from test_bag_repair import data_file, record, write
 
-from uwb_tdoa_bias.common import limits
+from uwb_tdoa_bias.common import errors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.sensors import Ranges
-from uwb_tdoa_tools.bags import MCAP, repair
+from uwb_tdoa_tools.bags import MCAP, files
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS, open_bag
 from uwb_tdoa_tools.bags.messages import messages_of, typestore
@@ -84,7 +84,7 @@ def test_nothing_in_a_database_is_computed(tables, statements):
 
 def test_a_row_that_fills_the_memory(tables, monkeypatch):
     bag, run = tables
-    monkeypatch.setattr(repair, "_MESSAGES", repair._MESSAGES.replace("67108864", "1000000"))
+    monkeypatch.setattr(files, "_MESSAGES", files._MESSAGES.replace("67108864", "1000000"))
     run("UPDATE messages SET data = zeroblob(1000001) WHERE id = 20")
     assert read_bag(bag).meta["remarks"] == [
         "bag.db3: 1 messages cannot be read: left out.",
@@ -94,8 +94,8 @@ def test_a_row_that_fills_the_memory(tables, monkeypatch):
 
 def test_messages_may_not_be_larger_than_all_of_them_may(tables, monkeypatch):
     bag, run = tables
-    monkeypatch.setattr(limits, "UNPACKED_FREE", 0)
-    monkeypatch.setattr(limits, "UNPACKED_RATIO", 0.1)
+    monkeypatch.setattr(errors, "UNPACKED_FREE", 0)
+    monkeypatch.setattr(errors, "UNPACKED_RATIO", 0.1)
     run("PRAGMA user_version = 1")
     assert (
         "its messages are larger than they may be"
@@ -107,7 +107,7 @@ def test_packed_files_may_not_unfold_to_more_than_all_of_them_may(tmp_path):
     """Three files of 33 kB unpacked to 3 GiB. Here each unpacks to 32 MiB, and the limit is 16 MiB."""
     (tmp_path / "bag").mkdir()
     for number in range(3):
-        packed = repair.zstd.compress(bytes(32 << 20))
+        packed = files.zstd.compress(bytes(32 << 20))
         (tmp_path / "bag" / f"bag_{number}.mcap.zstd").write_bytes(packed)
     with pytest.raises(
         InputError, match="more than [12][0-9]{7} bytes when its files are unpacked"
@@ -117,7 +117,7 @@ def test_packed_files_may_not_unfold_to_more_than_all_of_them_may(tmp_path):
 
 def test_a_packed_message_is_unpacked_to_a_limited_size(tmp_path, monkeypatch):
     monkeypatch.setattr("uwb_tdoa_tools.bags.files.MESSAGE_BYTES", 1000)
-    bomb = repair.zstd.compress(bytes(1 << 24))
+    bomb = files.zstd.compress(bytes(1 << 24))
     bag = with_bad_messages(tmp_path / "bag", "mcap", ["/imu/data"], bad=lambda data: bomb)
     flight = read_bag(bag)
     assert len(flight.imu) == 199 and "1 messages left out" in flight.meta["remarks"][0]
@@ -129,7 +129,7 @@ def chunk(compression, packed, size, crc=0):
     return record(0x06, head + struct.pack("<Q", len(packed)) + packed)
 
 
-BOMB = chunk(b"zstd", repair.zstd.compress(bytes(8 << 20)), 8 << 20)
+BOMB = chunk(b"zstd", files.zstd.compress(bytes(8 << 20)), 8 << 20)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ BOMB = chunk(b"zstd", repair.zstd.compress(bytes(8 << 20)), 8 << 20)
     [
         (chunk(b"", b"", 80 << 30), "claims 85899345920 bytes"),
         (chunk(b"", b"abc", 4), "cut"),
-        (chunk(b"zstd", repair.zstd.compress(bytes(1 << 28)), 1000), "the size or the checksum"),
+        (chunk(b"zstd", files.zstd.compress(bytes(1 << 28)), 1000), "the size or the checksum"),
         (chunk(b"lz4", lz4.frame.compress(bytes(1 << 26)), 1000), "the size or the checksum"),
         (chunk(b"zstd", b"nothing packed", 10), "cannot be unpacked"),
         (chunk(b"lz4", b"nothing packed", 10), "cannot be unpacked"),
@@ -152,7 +152,7 @@ BOMB = chunk(b"zstd", repair.zstd.compress(bytes(8 << 20)), 8 << 20)
     ],
 )
 def test_sizes_are_checked_before_they_are_believed(tmp_path, monkeypatch, content, said):
-    monkeypatch.setattr(limits, "UNPACKED_FREE", 1 << 20)
+    monkeypatch.setattr(errors, "UNPACKED_FREE", 1 << 20)
     file = tmp_path / "forged.mcap"
     file.write_bytes(MCAP + content)
     with pytest.raises(InputError, match=f"no message that can be read.*{said}"):
@@ -342,7 +342,7 @@ def test_pages_that_share_their_children_are_not_walked_for_ever(tables, table, 
     """A file of 53 kB hung the reader forever. Five levels hold 10^13 rows."""
     bag, _ = tables
     assert shared_children(data_file(bag), table) < 200_000
-    monkeypatch.setattr(limits, "SECONDS", 0.5)
+    monkeypatch.setattr(errors, "SECONDS", 0.5)
     if table == "messages":  # the rows before the circle are read
         assert "out of order" in read_bag(bag, anchors=ANCHORS).meta["remarks"][0]
     else:
@@ -355,8 +355,8 @@ def test_an_interrupt_ends_a_walk_through_a_database(tables):
     bag, _ = tables
     shared_children(data_file(bag), "topics")
     code = (
-        "import sys; from uwb_tdoa_bias.common import limits; limits.SECONDS = 1e9\n"
-        "from uwb_tdoa_tools.bags import repair; repair.Budget.is_late = lambda self: "
+        "import sys; from uwb_tdoa_bias.common import errors; errors.SECONDS = 1e9\n"
+        "from uwb_tdoa_tools.bags import files; files.Budget.is_late = lambda self: "
         "print('walks', flush=True)\n"
         "from uwb_tdoa_bias.common.executable import executable\n"
         "sys.exit(executable('uwb_tdoa_tools.commands.check')())"

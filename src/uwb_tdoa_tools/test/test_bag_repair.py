@@ -22,9 +22,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import Pressure, Velocity
 from uwb_tdoa_tools.bags import MCAP, is_bag
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
-from uwb_tdoa_tools.bags.files import PLUGINS, open_bag
+from uwb_tdoa_tools.bags.files import PLUGINS, open_bag, zstd
 from uwb_tdoa_tools.bags.messages import typestore
-from uwb_tdoa_tools.bags.repair import zstd
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 

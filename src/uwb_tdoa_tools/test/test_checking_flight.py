@@ -21,7 +21,7 @@ from uwb_tdoa_tools.checking.flight_rules import judge_against_truth, judge_flig
 from uwb_tdoa_tools.checking.motion_rules import TrueMotion, judge_imu, truth_unit
 from uwb_tdoa_tools.checking.pair_rules import KnownPath, repairs
 from uwb_tdoa_tools.checking.time_rules import delays, wrong_stamps
-from uwb_tdoa_tools.scoring.alignment import require_truth
+from uwb_tdoa_tools.scoring.evaluation import require_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 # --- checking flight rules ---

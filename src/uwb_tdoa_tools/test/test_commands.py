@@ -17,7 +17,7 @@ from programs import python, start
 import pytest
 import yaml
 
-from uwb_tdoa_bias.common.text import written_by
+from uwb_tdoa_bias.common.errors import written_by
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools import choices, cli, command_lines, main as uwb_tdoa
 from uwb_tdoa_tools.bags.bag import write_bag

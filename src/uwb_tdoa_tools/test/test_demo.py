@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 pytest.importorskip("rclpy")
 import known_answer  # noqa: E402
 
-from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_odometry  # noqa: E402
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402

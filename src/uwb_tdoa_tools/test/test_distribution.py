@@ -18,7 +18,7 @@ from documented import ROOT
 import programs
 import pytest
 
-from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.common.errors import version
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import main
 from uwb_tdoa_tools.bags.bag import write_bag

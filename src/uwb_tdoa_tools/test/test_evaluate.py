@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_ekf.offline import run_offline

@@ -13,7 +13,7 @@ from programs import run
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code, write_c
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx

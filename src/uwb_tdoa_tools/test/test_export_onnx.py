@@ -23,8 +23,8 @@ from uwb_tdoa_bias.correction.model import (  # noqa: E402
     NETWORK,
     PASSED,
     ExportedCorrection,
+    load_network,
 )
-from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_bias.correction.session import Session  # noqa: E402
 from uwb_tdoa_bias.effects import (
     EFFECTS as DECLARED,  # noqa: E402

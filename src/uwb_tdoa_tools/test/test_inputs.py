@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from recordings import ROWS, SURVEY, log_bytes, small_flight
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import FOLDER_DEPTH, InputError, TooMuch
 from uwb_tdoa_bias.common.files import read_arrays, read_bytes
 from uwb_tdoa_bias.common.flight import Tdoas
-from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, TooMuch
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.survey import read_named_anchors, read_survey
 from uwb_tdoa_tools.bags.bag import write_bag

@@ -15,7 +15,7 @@ LICENCE = "# SPDX-License-Identifier: Apache-2.0\n"
 WRONG = """
 from nav_msgs.msg import Odometry
 from std_srvs.srv import Trigger
-from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.common.errors import version
 from uwb_tdoa_bias.ros.cdr import decode
 from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.topics import Input, SubscribingNode

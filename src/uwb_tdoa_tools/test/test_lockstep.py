@@ -20,7 +20,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 import known_answer  # noqa: E402
 import programs  # noqa: E402
 
-from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_ekf.core.memory import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import new_bag, open_bag  # noqa: E402

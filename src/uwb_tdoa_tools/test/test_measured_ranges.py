@@ -15,8 +15,7 @@ from uwb_tdoa_tools.choices import FRAME
 from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers import load_profile, read_by_profile
-from uwb_tdoa_tools.scoring.alignment import estimate_alignment
-from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.scoring.evaluation import estimate_alignment, evaluate
 from uwb_tdoa_tools.scoring.metrics import Score, radio_residuals
 
 

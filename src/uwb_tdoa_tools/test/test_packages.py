@@ -11,7 +11,7 @@ import pytest
 import setuptools
 import yaml
 
-from uwb_tdoa_bias.common.text import version, written_by
+from uwb_tdoa_bias.common.errors import version, written_by
 
 PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))
 PYTHON = [folder for folder in PACKAGES if (folder / "setup.py").exists()]

@@ -33,8 +33,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 import uwb_tdoa
 import yaml
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.limits import TooMuch, most_unpacked
+from uwb_tdoa_bias.common.errors import InputError, TooMuch, most_unpacked
 from uwb_tdoa_bias.common.survey import NamedAnchors, read_named_anchors
 from uwb_tdoa_tools.checking.check import check as judged
 from uwb_tdoa_tools.checking.recording import of_flight

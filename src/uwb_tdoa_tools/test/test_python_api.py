@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import uwb_tdoa as uwb
 
-from uwb_tdoa_bias.common.text import version
+from uwb_tdoa_bias.common.errors import version
 from uwb_tdoa_bias.effects import EFFECTS
 
 # A new version may add names and arguments, but not remove them.

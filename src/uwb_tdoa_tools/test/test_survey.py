@@ -6,9 +6,9 @@ import pytest
 from recordings import ANCHORS, SURVEY
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import UNITS
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.survey import ARM_TIPS, orientation_from_tips, read_survey
-from uwb_tdoa_bias.common.survey_faults import UNITS
 
 SOME = Rotation.from_euler("zyx", [0.7, -0.2, 3.0])  # nearly upside down
 CENTRE = np.array([3.0, -2.0, 1.5])

@@ -6,7 +6,7 @@ import json
 import pytest
 from training_flights import flight, without_attitude
 
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import train

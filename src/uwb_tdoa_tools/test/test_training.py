@@ -11,8 +11,7 @@ from training_flights import flight, without_attitude
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_bias.correction.features import FEATURES
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.scoring.pooling import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, shrinking

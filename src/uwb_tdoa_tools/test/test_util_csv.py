@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
 
-from uwb_tdoa_bias.common import limits
+from uwb_tdoa_bias.common import errors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.readers import read_util_csv, tables
 
@@ -238,7 +238,7 @@ def test_a_million_empty_members_of_gzip_take_no_time(read):
 
 
 def test_the_limit_of_seconds_holds_within_gzip(read, monkeypatch):
-    monkeypatch.setattr(limits, "SECONDS", 0.0)
-    monkeypatch.setattr(limits, "SECONDS_PER_BYTE", 0.0)
-    with pytest.raises(limits.TooMuch, match="takes more than 0.0 s of processor time to read"):
+    monkeypatch.setattr(errors, "SECONDS", 0.0)
+    monkeypatch.setattr(errors, "SECONDS_PER_BYTE", 0.0)
+    with pytest.raises(errors.TooMuch, match="takes more than 0.0 s of processor time to read"):
         read(gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode()))

@@ -27,8 +27,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.alignment import transform_truth
-from uwb_tdoa_tools.scoring.evaluation import score_of
+from uwb_tdoa_tools.scoring.evaluation import score_of, transform_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 pytestmark = pytest.mark.slow

@@ -83,7 +83,7 @@ Kind = TypeVar("Kind", bound="type[Effect]")
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from uwb_tdoa_bias.common.text import version
+        from uwb_tdoa_bias.common.errors import version
 
         return version()
     if name in _PLACES:
@@ -251,8 +251,7 @@ def _estimate(
     model: Model | str | Path | None,
     smoothed: bool,
 ) -> Run:
-    from uwb_tdoa_bias.correction.model import Model
-    from uwb_tdoa_bias.correction.network import load_network
+    from uwb_tdoa_bias.correction.model import Model, load_network
     from uwb_tdoa_tools.estimate import FlightEstimator
 
     network = model if model is None or isinstance(model, Model) else load_network(model)
@@ -270,8 +269,7 @@ def errors(flight: Flight, run: Run, effects: EffectSet | None = None) -> Score:
     effects : EffectSet or None
         Those of the Run: an effect on the ground truth is corrected here.
     """
-    from uwb_tdoa_tools.scoring.alignment import require_truth
-    from uwb_tdoa_tools.scoring.evaluation import corrected_truth
+    from uwb_tdoa_tools.scoring.evaluation import corrected_truth, require_truth
     from uwb_tdoa_tools.scoring.metrics import Score, radio_residuals
 
     require_truth(flight)

@@ -26,9 +26,8 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import Failure, InputError
+from uwb_tdoa_bias.common.errors import Failure, InputError, line_of, printable, written_by
 from uwb_tdoa_bias.common.files import protected_inputs, refuse_output, write_text
-from uwb_tdoa_bias.common.text import line_of, printable, written_by
 
 from . import command_lines
 

@@ -29,8 +29,13 @@ from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, Recording, report_remarks
-from .scoring.alignment import Alignment, estimate_alignment, require_truth
-from .scoring.evaluation import corrected_truth, delays_fit
+from .scoring.evaluation import (
+    Alignment,
+    corrected_truth,
+    delays_fit,
+    estimate_alignment,
+    require_truth,
+)
 from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import TITLES
 from .scoring.pooling import Result

@@ -16,8 +16,8 @@ import os
 from pathlib import Path
 import sys
 
+from uwb_tdoa_bias.common.errors import written_by
 from uwb_tdoa_bias.common.executable import executable
-from uwb_tdoa_bias.common.text import written_by
 
 from .command_lines import COMMAND, RUN
 

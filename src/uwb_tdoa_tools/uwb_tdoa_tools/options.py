@@ -277,7 +277,7 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
 
 def estimator_of(args: Namespace) -> FlightEstimator:
     """Return the FlightEstimator for these options. Raises InputError."""
-    from uwb_tdoa_bias.correction.network import load_network
+    from uwb_tdoa_bias.correction.model import load_network
 
     from .estimate import FlightEstimator
 

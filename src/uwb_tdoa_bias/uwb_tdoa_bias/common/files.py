@@ -20,8 +20,7 @@ import zlib
 
 import numpy as np
 
-from .errors import InputError
-from .limits import ARRAYS_BYTES, RECORDING_BYTES, Budget
+from .errors import ARRAYS_BYTES, RECORDING_BYTES, Budget, InputError
 
 TEMPORARY = "uwb_tdoa_temporary_"  # prefix of the project's temporary folders
 STREAMS = "/dev/stdout", "/dev/stderr"  # links that the user redirects

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .anchors import Anchors
+from .errors import sanitize
 from .sensors import LOCATING, SENSORS
-from .text import sanitize
 
 SENSOR_NAMES = tuple(SENSORS)  # optional streams of a Flight
 

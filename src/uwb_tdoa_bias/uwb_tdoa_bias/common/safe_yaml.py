@@ -20,9 +20,8 @@ from yaml.composer import Composer
 from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
-from .errors import InputError
+from .errors import YAML_BYTES, YAML_DEPTH, YAML_NODES, Budget, InputError
 from .files import open_file
-from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES, Budget
 
 
 def read_yaml(path: str | Path) -> Any:

@@ -13,13 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .anchors import FARTHEST, Anchors
-from .errors import InputError
+from .anchors import FARTHEST, GEODETIC, UNITS, Anchors, refuse_faulty
+from .errors import SURVEY_BYTES, InputError
 from .files import read_bytes
 from .lazy import rotations
-from .limits import SURVEY_BYTES
 from .safe_yaml import parse_yaml
-from .survey_faults import GEODETIC, UNITS, refuse_faulty
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 

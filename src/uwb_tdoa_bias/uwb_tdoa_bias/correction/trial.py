@@ -27,14 +27,8 @@ try:
 except ImportError:  # Windows limits no process
     resource = None  # type: ignore[assignment]  # None marks the missing module
 
+from ..common.errors import MODEL_MEMORY, MODEL_NODES, MODEL_ROW_SECONDS, MODEL_SECONDS, MODEL_WAIT
 from ..common.files import temporary_folder
-from ..common.limits import (
-    MODEL_MEMORY,
-    MODEL_NODES,
-    MODEL_ROW_SECONDS,
-    MODEL_SECONDS,
-    MODEL_WAIT,
-)
 from .session import BATCH, PACKED, Session, Unplayable, onnxruntime
 
 OPERATORS = (

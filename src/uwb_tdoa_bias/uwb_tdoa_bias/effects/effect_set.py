@@ -17,11 +17,10 @@ import numpy as np
 import yaml
 
 from ..common.anchors import Anchors
-from ..common.errors import InputError
+from ..common.errors import InputError, written_by
 from ..common.files import write_text
 from ..common.flight import Flight
 from ..common.safe_yaml import read_yaml
-from ..common.text import written_by
 from .anchor import (
     AnchorClockDrift,
     AnchorDelay,

@@ -13,10 +13,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from ..common.anchors import SAME_PLACE, Anchors
+from ..common.anchors import SAME_PLACE, Anchors, refuse_faulty
 from ..common.errors import InputError
 from ..common.survey import read_survey
-from ..common.survey_faults import refuse_faulty
 from .parameters import Parameter
 from .topics import Input, Refusals, publishers_of
 

@@ -27,9 +27,8 @@ from rclpy.timer import Timer
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
 
-from ..common.errors import InputError
+from ..common.errors import InputError, line_of
 from ..common.executable import interrupt
-from ..common.text import line_of
 from .cdr import Message, decode
 from .parameters import ParameterNode
 from .topics import unserved, waiting

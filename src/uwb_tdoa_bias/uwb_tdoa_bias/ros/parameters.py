@@ -37,8 +37,7 @@ from rclpy.service import Service
 import yaml
 from yaml import MappingNode
 
-from ..common.errors import InputError
-from ..common.text import line_of
+from ..common.errors import InputError, line_of
 
 KINDS = {
     float: "a number with a decimal point, e.g. 1.0",

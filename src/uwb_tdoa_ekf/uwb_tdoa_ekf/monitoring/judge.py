@@ -18,10 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import UNITS, Anchors
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
-from uwb_tdoa_bias.common.survey_faults import UNITS
 
 from ..core.ground import solve
 from .explain import SCALE, compare_losses, in_words

@@ -29,9 +29,8 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import DEFINITION_BYTES, InputError
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
-from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS, Sensor, Stream
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import as_named
-from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 
 from ..bags import is_bag, messages as bag_messages
 from ..bags.files import open_bag, remarks_of

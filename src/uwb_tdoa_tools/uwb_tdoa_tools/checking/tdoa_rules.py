@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import UNITS as SURVEY_UNITS, Anchors
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
-from uwb_tdoa_bias.common.survey_faults import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, in_words, innovations

@@ -130,7 +130,7 @@ def _measured(args: Namespace) -> int:
     """Take a measured flight through both nodes."""
     from ..evaluating import lines_of_errors
     from ..flying import demo
-    from ..scoring.alignment import require_truth
+    from ..scoring.evaluation import require_truth
     from ..scoring.pairs import residuals_of
 
     started = time.monotonic()

@@ -82,7 +82,7 @@ def parser() -> ArgumentParser:
 def _export(args: Namespace) -> None:
     from uwb_tdoa_bias.common.survey import read_named_anchors
     from uwb_tdoa_bias.correction.corrector import orientation_remarks
-    from uwb_tdoa_bias.correction.network import load_network
+    from uwb_tdoa_bias.correction.model import load_network
     from uwb_tdoa_bias.effects import EffectSet
 
     if not (args.effects or args.model):

@@ -166,7 +166,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _fly(args: argparse.Namespace) -> int:
-    from uwb_tdoa_bias.correction.network import load_network
+    from uwb_tdoa_bias.correction.model import load_network
 
     from ..flying import rover, verdict
     from ..flying.mission import Circles, Waypoints

@@ -20,11 +20,10 @@ import onnx
 from onnx import numpy_helper
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, version
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet
 
 from . import crazyflie

@@ -28,7 +28,7 @@ from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 
-from ..scoring.alignment import require_truth
+from ..scoring.evaluation import require_truth
 from ..scoring.metrics import position_at, rms, scored_phase
 
 LARGEST_ID = 255  # of an anchor in the firmware

@@ -24,10 +24,8 @@ from onnx import (
 )
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import MODEL_BYTES, InputError, version
 from uwb_tdoa_bias.common.files import write_bytes
-from uwb_tdoa_bias.common.limits import MODEL_BYTES
-from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS, Model
 from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 from uwb_tdoa_bias.effects import EffectSet

@@ -23,11 +23,9 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.arrays import SymbolicArray
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.text import written_by
+from uwb_tdoa_bias.common.errors import InputError, written_by
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS, Model
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import INPUTS, KIND, OUTPUTS, Model, Network
 from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_bias.effects.effect_set import REACH

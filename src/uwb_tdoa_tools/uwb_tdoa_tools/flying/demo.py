@@ -22,7 +22,7 @@ import numpy as np
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import listed, rounded
 from uwb_tdoa_ekf.offline import run_offline

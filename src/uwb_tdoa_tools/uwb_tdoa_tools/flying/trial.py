@@ -16,8 +16,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.model import Model
-from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.correction.model import Model, load_network
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator

@@ -15,11 +15,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.survey import Entry, NamedAnchors, as_named, name_of, named_anchors
-from uwb_tdoa_bias.common.survey_faults import refuse_faulty
 
 from ..bags import is_bag, is_ros_1
 from .profile import (

@@ -24,17 +24,16 @@ from rosbags.rosbag1.reader import Compression, decompressors
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.limits import (
+from uwb_tdoa_bias.common.errors import (
     CHUNK_BYTES,
     DEFINITION_BYTES,
+    InputError,
     TooMuch,
     most_unpacked,
 )
 
 from ..bags import is_ros_1
-from ..bags.files import BagReader, Decoder, Incomplete, open_bag, readable, remarks_of
-from ..bags.repair import Damaged
+from ..bags.files import BagReader, Damaged, Decoder, Incomplete, open_bag, readable, remarks_of
 from ..bags.topics import Recorded, recorded_anchors
 from .tables import BLOCK, Block, Foreign, Wanted
 

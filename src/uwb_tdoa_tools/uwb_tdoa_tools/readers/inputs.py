@@ -13,12 +13,10 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import FOLDER_DEPTH, FOLDER_ENTRIES, Budget, InputError, printable
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
-from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.common.survey import as_named
-from uwb_tdoa_bias.common.text import printable
 
 from .. import parallel
 from ..bags import BESIDE, is_bag, is_one_bag

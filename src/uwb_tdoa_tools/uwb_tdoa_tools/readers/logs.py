@@ -17,12 +17,10 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.compiled import compiled
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import USD_TYPES, USD_VARIABLES, Budget, InputError, sanitize
 from uwb_tdoa_bias.common.files import read_bytes
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.limits import USD_TYPES, USD_VARIABLES, Budget
 from uwb_tdoa_bias.common.survey import NamedAnchors
-from uwb_tdoa_bias.common.text import sanitize
 
 from ..command_lines import SALVAGE
 from .by_profile import flight_name, streams_of

@@ -17,12 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
+from uwb_tdoa_bias.common.errors import DEFINITION_BYTES, InputError, sanitize
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.survey import name_of
-from uwb_tdoa_bias.common.text import sanitize
 
 from .streams import GRAVITY
 

@@ -12,9 +12,8 @@ import shlex
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, printable
 from uwb_tdoa_bias.common.files import read_head
-from uwb_tdoa_bias.common.text import printable
 
 from ..command_lines import suggest_line
 from .by_profile import SINGLE, as_time, files_of, open_recording

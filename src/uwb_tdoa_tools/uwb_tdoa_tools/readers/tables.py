@@ -24,16 +24,16 @@ import zlib
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import read_bytes, read_head
-from uwb_tdoa_bias.common.limits import (
+from uwb_tdoa_bias.common.errors import (
     ROW_CHARACTERS,
     SMALL_TABLE_CELLS,
     TABLE_BYTES,
     TABLE_CELLS,
     Budget,
+    InputError,
     most_unpacked,
 )
+from uwb_tdoa_bias.common.files import read_bytes, read_head
 
 from ..command_lines import SALVAGE
 

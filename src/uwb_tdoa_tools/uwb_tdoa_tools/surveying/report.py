@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import TABLE_CELLS, InputError
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.limits import TABLE_CELLS
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.effects import Effect, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig

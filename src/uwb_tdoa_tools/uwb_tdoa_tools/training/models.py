@@ -28,7 +28,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_bytes, write_filled
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
-from uwb_tdoa_bias.correction.features import ATTITUDE, FEATURES, columns
+from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, columns
 from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, Samples
 
 from ..choices import MODELS

@@ -18,7 +18,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
-from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet
 
 from ..parallel import MapFunction
