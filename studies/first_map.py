@@ -16,7 +16,7 @@ from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.first_map import map_anchors, observe
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation
+from uwb_tdoa_tools.simulation.config import constellation
 
 from . import table
 from .surveying import at, rmse

@@ -49,7 +49,7 @@ from uwb_tdoa_tools.readers import (
 )
 from uwb_tdoa_tools.readers.profile import Profile, parse_columns
 from uwb_tdoa_tools.readers.suggest import suggest
-from uwb_tdoa_tools.simulation.rooms import Walls
+from uwb_tdoa_tools.simulation.config import Walls
 from uwb_tdoa_tools.surveying.report import read_distances, read_marks
 
 from . import table

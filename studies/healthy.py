@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation, facing
+from uwb_tdoa_tools.simulation.config import constellation, facing
 
 from .any_path import Path
 from .situations import _pocket, _round

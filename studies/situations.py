@@ -23,7 +23,7 @@ from uwb_tdoa_tools.cli import as_json
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.scoring.pooling import PooledErrors
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import corners, facing
+from uwb_tdoa_tools.simulation.config import corners, facing
 
 from . import table
 from .any_path import Path, between

@@ -16,7 +16,7 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import Effect, EffectSet
 from uwb_tdoa_bias.effects.base import SensorFunction
-from uwb_tdoa_bias.effects.covariates import OF_STATE, STATES
+from uwb_tdoa_bias.effects.samples import OF_STATE, STATES
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.cli import as_json
 from uwb_tdoa_tools.diagnosis import diagnose

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwb_tdoa_bias.effects import true_samples
-from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures
-from uwb_tdoa_bias.effects.samples import Track
+from uwb_tdoa_bias.effects.samples import OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFeatures, Track
 
 SHAPES = ("trend", "step", "ramp", "periodic", "transient", "bend")
 # m, rad/s, m/s^2; drawn evenly in the logarithm

@@ -21,9 +21,9 @@ from uwb_tdoa_ekf.monitoring.status import FAULT, RUNNING, Use, status_of
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.flying.sensors import world_of
 from uwb_tdoa_tools.flying.simulator import Streams
 from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial
+from uwb_tdoa_tools.flying.vehicle import world_of
 from uwb_tdoa_tools.flying.verdict import verdict_of
 
 from .. import table

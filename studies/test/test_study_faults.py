@@ -24,8 +24,8 @@ from studies.faults.flown import BEGIN, FaultyFilter  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
-from uwb_tdoa_tools.flying.sensors import world_of  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task, Trial  # noqa: E402
+from uwb_tdoa_tools.flying.vehicle import world_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 TRUTH = Truth(

@@ -16,7 +16,7 @@ from uwb_tdoa_tools.checking.check import processed_streams
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.planning.maps import TOO_FEW
 from uwb_tdoa_tools.planning.precision import FixedNoise, RadioNoise
-from uwb_tdoa_tools.simulation.rooms import Room
+from uwb_tdoa_tools.simulation.config import Room
 
 
 def test_the_motion_of_a_path_is_its_derivative_and_what_a_sensor_feels():

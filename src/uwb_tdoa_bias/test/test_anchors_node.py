@@ -18,8 +18,7 @@ from uwb_tdoa_bias.anchors_node import PARAMETERS, AnchorsNode  # noqa: E402
 from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message, same_anchors  # noqa: E402
-from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message, same_anchors  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "anchors_node.yaml"

@@ -47,7 +47,7 @@ from uwb_tdoa_bias.effects import (
     true_samples,
 )
 from uwb_tdoa_bias.effects.base import counted, listed, measured, relabelled
-from uwb_tdoa_bias.effects.stamps import StampEffect
+from uwb_tdoa_bias.effects.sensor import StampEffect
 
 # --- effects ---
 

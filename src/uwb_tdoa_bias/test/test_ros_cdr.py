@@ -16,8 +16,8 @@ from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.ros import cdr
+from uwb_tdoa_bias.ros.anchors import read_transforms
 from uwb_tdoa_bias.ros.cdr import LONGEST_TEXT, MOST_ELEMENTS, CdrCodec, Unreadable, decode
-from uwb_tdoa_bias.ros.frames import read_transforms
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 # --- encodings ---

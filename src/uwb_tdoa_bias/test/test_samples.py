@@ -21,8 +21,7 @@ from uwb_tdoa_bias.common.vibration import (
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, NAMES, columns, everything
 from uwb_tdoa_bias.effects import EffectSet, Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import covariate_of
-from uwb_tdoa_bias.effects.samples import Motion, motion_at, preceding
+from uwb_tdoa_bias.effects.samples import Motion, covariate_of, motion_at, preceding
 
 # --- samples ---
 

@@ -12,7 +12,7 @@ import yaml
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import RADIO, EffectSet, Samples, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import fade_weight
+from uwb_tdoa_bias.effects.samples import fade_weight
 from uwb_tdoa_bias.effects.smooth_term import FACTORS, SHAPES, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}

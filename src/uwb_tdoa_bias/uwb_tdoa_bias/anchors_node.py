@@ -22,8 +22,7 @@ from uwb_tdoa_msgs.msg import AnchorArray
 
 from .common.errors import InputError
 from .common.survey import read_survey
-from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
-from .ros.frames import TF_STATIC_QOS
+from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message
 from .ros.node import StreamNode, run
 from .ros.parameters import (
     FROZEN,

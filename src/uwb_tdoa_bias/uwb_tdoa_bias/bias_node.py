@@ -40,10 +40,9 @@ from .correction.model import EFFECTS, FADED, NETWORK, PASSED, load_network
 from .effects import EffectSet, LabelEffect
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm
-from .ros.anchors import ANCHORS_FILE, AnchorsInput
+from .ros.anchors import ANCHORS_FILE, AnchorsInput, FramesInput, unknown_frame
 from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.diagnostics import Diagnostics, Rate, Report
-from .ros.frames import FramesInput, unknown_frame
 from .ros.node import StreamNode, StreamPoller, run
 from .ros.parameters import (
     FROZEN,

@@ -24,7 +24,7 @@ from uwb_tdoa_bias.common.robust_loss import LOSSES
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import OF_STATE
+from uwb_tdoa_bias.effects.samples import OF_STATE
 from uwb_tdoa_ekf.core import auxiliary, config, height, plane, sensors, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed

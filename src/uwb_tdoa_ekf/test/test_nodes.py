@@ -44,8 +44,7 @@ from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.sensor import AccelBias
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.ros.anchors import anchors_to_message
-from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS
+from uwb_tdoa_bias.ros.anchors import TF_QOS, TF_STATIC_QOS, anchors_to_message
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import poses_of, rows_of, to_odometry

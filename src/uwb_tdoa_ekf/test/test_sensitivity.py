@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
-from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
+from uwb_tdoa_ekf.smoother import FORGOTTEN, record_innovations
 
 # Without decisions and adaptation the filter is nearly linear.
 PLAIN = FilterConfig(

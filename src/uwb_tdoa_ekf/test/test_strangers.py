@@ -20,8 +20,7 @@ from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from uwb_tdoa_bias.common.anchors import MOST, Anchors  # noqa: E402
-from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message  # noqa: E402
-from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 pytestmark = pytest.mark.slow  # starts nodes

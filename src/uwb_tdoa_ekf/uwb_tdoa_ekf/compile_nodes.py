@@ -24,7 +24,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction import corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import ImuFeatures
+from uwb_tdoa_bias.effects.samples import ImuFeatures
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator

@@ -15,9 +15,8 @@ import numpy as np
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.lazy import rotations
-from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS, TF_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
-from uwb_tdoa_bias.ros.frames import TF_QOS
 from uwb_tdoa_bias.ros.topics import Epoch, StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 

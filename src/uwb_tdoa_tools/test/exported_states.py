@@ -12,8 +12,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.correction.session import Session
 from uwb_tdoa_bias.effects import EFFECTS, Samples, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, OF_ARRIVAL, OF_TDOA
-from uwb_tdoa_bias.effects.samples import Motion
+from uwb_tdoa_bias.effects.samples import CATEGORIES, OF_ARRIVAL, OF_TDOA, Motion
 from uwb_tdoa_bias.effects.smooth_term import FACTORS, OF_LINKS, SHAPES
 from uwb_tdoa_tools.exporting.tracing import is_traceable
 from uwb_tdoa_tools.training import models as training

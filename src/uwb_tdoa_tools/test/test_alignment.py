@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorDelay
-from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import evaluate as evaluate_command

@@ -35,7 +35,7 @@ from uwb_tdoa_tools.checking.recording_rules import sensor_mistakes
 from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation
+from uwb_tdoa_tools.simulation.config import constellation
 
 OTHER_ROOM = constellation("random-5")
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))

@@ -15,7 +15,7 @@ from uwb_tdoa_tools.checking.report import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation
+from uwb_tdoa_tools.simulation.config import constellation
 
 
 def flown(seed):

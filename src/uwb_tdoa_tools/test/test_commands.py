@@ -23,10 +23,9 @@ from uwb_tdoa_tools import choices, cli, command_lines, main as uwb_tdoa
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
-from uwb_tdoa_tools.flying.sensors import WORLDS
+from uwb_tdoa_tools.flying.vehicle import WORLDS
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS, corners
 from uwb_tdoa_tools.simulation.vehicles import TRAJECTORIES
 
 pytest.importorskip("uwb_tdoa_msgs.msg")

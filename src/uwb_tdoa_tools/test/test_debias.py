@@ -17,7 +17,7 @@ from uwb_tdoa_tools.commands.debias import main
 from uwb_tdoa_tools.debiasing import part_of, static_parts
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.config import corners
 
 BIAS = np.array([0.1, -0.2])
 

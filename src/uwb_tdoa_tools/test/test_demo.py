@@ -29,7 +29,7 @@ from uwb_tdoa_tools.flying.demo import (  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import score_of  # noqa: E402
 from uwb_tdoa_tools.scoring.pairs import residuals_of  # noqa: E402
 from uwb_tdoa_tools.simulation import inject, simulate  # noqa: E402
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.config import corners
 
 
 @pytest.mark.parametrize(

@@ -19,9 +19,8 @@ import pytest
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import ImuFeatures
-from uwb_tdoa_bias.effects.samples import samples_at
-from uwb_tdoa_bias.effects.stamps import TruthTimeOffset
+from uwb_tdoa_bias.effects.samples import ImuFeatures, samples_at
+from uwb_tdoa_bias.effects.sensor import TruthTimeOffset
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute, near_floor, on_floor
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, TdoaResidual, base, residuals

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors.height import Height
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import diagnosis, parallel
 from uwb_tdoa_tools.bags.bag import write_bag

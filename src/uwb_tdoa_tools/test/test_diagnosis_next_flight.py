@@ -20,7 +20,7 @@ from uwb_tdoa_tools.diagnosis.next_flight import Model, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import maps
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import Room, constellation, corners, room_of
+from uwb_tdoa_tools.simulation.config import Room, constellation, corners, room_of
 
 RATES = {"imu_rate": 200.0, "truth_rate": 100.0, "start_in_air": True}
 

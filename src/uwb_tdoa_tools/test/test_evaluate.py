@@ -10,7 +10,7 @@ import yaml
 
 from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag

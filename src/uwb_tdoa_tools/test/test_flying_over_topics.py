@@ -23,8 +23,10 @@ from uwb_tdoa_tools.flying.over_topics import (  # noqa: E402
     OverTopics,
     RealTime,
 )
-from uwb_tdoa_tools.flying.sensors import HALL  # noqa: E402
-from uwb_tdoa_tools.flying.vehicle import STATE  # noqa: E402
+from uwb_tdoa_tools.flying.vehicle import (
+    HALL,
+    STATE,  # noqa: E402
+)
 
 
 class Pace:

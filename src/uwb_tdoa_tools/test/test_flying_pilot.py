@@ -12,8 +12,8 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.flying.mission import DONE, SETTLE, SINK
 from uwb_tdoa_tools.flying.pilot import MAX_SPEED, CommandedPath, Pilot
-from uwb_tdoa_tools.flying.sensors import HALL
 from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial
+from uwb_tdoa_tools.flying.vehicle import HALL
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 

@@ -13,8 +13,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
 from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, PLACES, REFUSED, Rules, Waypoints
-from uwb_tdoa_tools.flying.sensors import HALL, WORLDS
 from uwb_tdoa_tools.flying.trial import Task
+from uwb_tdoa_tools.flying.vehicle import HALL, WORLDS
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS

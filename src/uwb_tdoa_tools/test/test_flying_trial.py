@@ -14,7 +14,9 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.pressure import SITE
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.mission import DONE, HEIGHT, RISE, Circles, Rules
-from uwb_tdoa_tools.flying.sensors import (
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
+from uwb_tdoa_tools.flying.trial import Task, fly
+from uwb_tdoa_tools.flying.vehicle import (
     HALL,
     WORLDS,
     AuxiliarySensor,
@@ -22,8 +24,6 @@ from uwb_tdoa_tools.flying.sensors import (
     Radio,
     gusts,
 )
-from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
-from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS

@@ -14,7 +14,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.planning import optimisation, run
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.config import corners
 
 FILES = {"flyable.png", "flyable.npz", "plan_bag", "plan.json", "precision.png"}
 COARSE = ["--step", "0.5"]

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
 from uwb_tdoa_tools.planning.precision import Installation
 from uwb_tdoa_tools.planning.report import summary
 from uwb_tdoa_tools.planning.run import places_in_hall
-from uwb_tdoa_tools.simulation.rooms import Room
+from uwb_tdoa_tools.simulation.config import Room
 
 REACH = 15.0  # m
 

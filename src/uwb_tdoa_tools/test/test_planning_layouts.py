@@ -13,7 +13,6 @@ from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.planning import plots
-from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
@@ -31,10 +30,10 @@ from uwb_tdoa_tools.planning.optimisation import (
     lattice,
     optimise,
 )
-from uwb_tdoa_tools.planning.precision import Installation, RadioNoise
+from uwb_tdoa_tools.planning.precision import Installation, RadioNoise, Subsets
 from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
 from uwb_tdoa_tools.scoring.plots import draw_labels
-from uwb_tdoa_tools.simulation.rooms import corners, facing
+from uwb_tdoa_tools.simulation.config import corners, facing
 
 # --- planning optimisation ---
 

@@ -36,7 +36,7 @@ from uwb_tdoa_tools.planning.precision import (
 )
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
+from uwb_tdoa_tools.simulation.config import constellation, corners, facing
 
 # --- planning installation ---
 

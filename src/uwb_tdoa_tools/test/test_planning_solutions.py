@@ -12,13 +12,6 @@ from scipy.stats import norm
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.planning.bifurcation import (
-    CLEAR,
-    FLIP,
-    MOST_SUBSETS,
-    Subsets,
-    other_solutions,
-)
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
@@ -27,8 +20,17 @@ from uwb_tdoa_tools.planning.maps import (
     Grid,
     judge,
 )
-from uwb_tdoa_tools.planning.precision import FixedNoise, Installation, RadioNoise
-from uwb_tdoa_tools.simulation.rooms import Room, Walls, constellation, corners
+from uwb_tdoa_tools.planning.precision import (
+    CLEAR,
+    FLIP,
+    MOST_SUBSETS,
+    FixedNoise,
+    Installation,
+    RadioNoise,
+    Subsets,
+    other_solutions,
+)
+from uwb_tdoa_tools.simulation.config import Room, Walls, constellation, corners
 
 # --- planning bifurcation ---
 

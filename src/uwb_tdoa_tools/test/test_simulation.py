@@ -17,8 +17,15 @@ from uwb_tdoa_bias.common.sensors.pressure import altitude_of
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, ImuErrors, SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import PROTOCOLS, YAW_PROFILES
-from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, Walls, constellation, heard_at, room_of
+from uwb_tdoa_tools.simulation.config import (
+    CONSTELLATIONS,
+    PROTOCOLS,
+    YAW_PROFILES,
+    Walls,
+    constellation,
+    heard_at,
+    room_of,
+)
 from uwb_tdoa_tools.simulation.vehicles import TRAJECTORIES
 
 # --- simulate ---
@@ -374,7 +381,7 @@ def test_a_wall_stands_between(walls, p, q, blocked):
 
 
 def test_nothing_is_heard_through_a_wall(monkeypatch):
-    monkeypatch.setattr("uwb_tdoa_tools.simulation.rooms.AT_ONCE", 100)
+    monkeypatch.setattr("uwb_tdoa_tools.simulation.config.AT_ONCE", 100)
     anchors, walls = hall_of_cells(), Walls(((15.0, -1.0, 15.0, 20.0, np.inf),))
     p = np.random.default_rng(0).uniform((0.0, 0.0, 0.0), (28.0, 14.0, 3.0), (50, 3))
     far = np.linalg.norm(p[:, None] - anchors.positions, axis=2) > 12.0

@@ -17,8 +17,7 @@ from uwb_tdoa_bias.common.radio import (
     received_power_dbm,
 )
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import PROTOCOLS
-from uwb_tdoa_tools.simulation.rooms import constellation, heard_at
+from uwb_tdoa_tools.simulation.config import PROTOCOLS, constellation, heard_at
 from uwb_tdoa_tools.simulation.sensors import (
     floor_multipath,
     make_schedule,

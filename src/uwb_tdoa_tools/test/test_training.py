@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.scoring.pooling import SHARES, Shrinkage, best_share
-from uwb_tdoa_tools.training import models, shrinking
+from uwb_tdoa_tools.training import models
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
 
 # --- labels ---
@@ -226,7 +226,7 @@ def test_the_gain_of_a_larger_deviation_is_stated_apart():
 def test_a_flight_is_judged_by_what_it_took_no_part_in():
     late = EFFECTS["anchor_delay"]({"3": 0.4, "5": -0.4})
     flights = [late.inject(flight(seed)) for seed in range(2)] + [flight(2)]
-    told = shrinking.cross_validated(models.Recipe("paper", 0), flights)
+    told = models.cross_validated(models.Recipe("paper", 0), flights)
     assert set(told.errors) == {one.name for one in flights}
     alike, other = (told.errors[flights[k].name] for k in (0, 2))
     assert alike[1.0] < 0.95 * alike[None] and other[1.0] > 1.05 * other[None]

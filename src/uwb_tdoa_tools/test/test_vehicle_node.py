@@ -26,9 +26,9 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402
 from uwb_tdoa_tools.flying.mission import SPEED, Waypoints  # noqa: E402
-from uwb_tdoa_tools.flying.sensors import WORLDS  # noqa: E402
 from uwb_tdoa_tools.flying.simulator import DT  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
+from uwb_tdoa_tools.flying.vehicle import WORLDS
 from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import PARAMETERS, VehicleNode  # noqa: E402
 

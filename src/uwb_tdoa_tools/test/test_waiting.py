@@ -21,7 +21,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.rooms import corners
+from uwb_tdoa_tools.simulation.config import corners
 
 # s, limits of the first message and of each silence; then the computing time that is measured if
 # the command is silent, also on a busy machine

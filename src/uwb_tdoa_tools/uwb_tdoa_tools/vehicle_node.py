@@ -41,8 +41,8 @@ from .flying import rover
 from .flying.mission import Circles, Waypoints
 from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
-from .flying.sensors import WORLDS, world_of
 from .flying.trial import Task, Trial
+from .flying.vehicle import WORLDS, world_of
 from .flying.verdict import reached, sentence, verdict_of
 
 Response = TypeVar("Response", Takeoff.Response, GoTo.Response, Land.Response)

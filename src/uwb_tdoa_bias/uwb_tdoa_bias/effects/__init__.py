@@ -26,7 +26,7 @@ The file, written by people and by the tools, read by the nodes:
 
 from .anchor import AnchorDelay
 from .base import ArrivalEffect, Effect, LabelEffect, Row
-from .effect_set import EFFECTS, Covariance, EffectSet
+from .effect_set import EFFECTS, Covariance, EffectSet, ImuCorrector, StreamCorrector
 from .samples import (
     RADIO,
     ImuSamples,
@@ -39,7 +39,6 @@ from .samples import (
     true_samples,
 )
 from .smooth_term import SmoothTerm
-from .streams import ImuCorrector, StreamCorrector
 from .tag import TagLeverArm
 
 __all__ = [

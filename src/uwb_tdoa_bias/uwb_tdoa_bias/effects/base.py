@@ -17,8 +17,16 @@ from ..common.anchors import Anchors
 from ..common.errors import InputError
 from ..common.flight import Flight
 from ..common.sensors import STREAM_OF, measured_on
-from .covariates import OF_ARRIVAL, checked_domain, covariate_of, fade_weight, shown_in
-from .samples import RADIO, Samples, true_samples
+from .samples import (
+    OF_ARRIVAL,
+    RADIO,
+    Samples,
+    checked_domain,
+    covariate_of,
+    fade_weight,
+    shown_in,
+    true_samples,
+)
 
 __all__ = ["ArrivalEffect", "Effect", "Row", "Samples"]
 

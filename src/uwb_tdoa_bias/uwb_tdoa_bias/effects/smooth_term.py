@@ -31,7 +31,8 @@ from .base import (
     measured,
     rounded,
 )
-from .covariates import (
+from .pair import of_pair
+from .samples import (
     CATEGORIES,
     EXTRA,
     FADE,
@@ -43,15 +44,18 @@ from .covariates import (
     OF_STATE,
     OF_TDOA,
     ONLY_TDOA,
+    RADIO,
     STATES,
+    ImuSamples,
+    Samples,
+    SensorSamples,
     covariate_of,
     fade_weight,
     has_domain,
     sensor_covariate,
     shown_in,
+    tile,
 )
-from .pair import of_pair
-from .samples import RADIO, ImuSamples, Samples, SensorSamples, tile
 
 DEGREE = 2  # of splines
 GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left

@@ -16,7 +16,7 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
 from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
-from uwb_tdoa_bias.effects.covariates import OF_STATE
+from uwb_tdoa_bias.effects.samples import OF_STATE
 
 from .state import GRAVITY
 

@@ -151,7 +151,7 @@ def _diagnose(args: Namespace) -> int:
     from ..estimate import FlightEstimator
     from ..localizing.pictures import write_diagnosis
     from ..readers import inputs
-    from ..simulation.rooms import Room
+    from ..simulation.config import Room
     from ..surveying.report import read_paths
 
     out = args.out

@@ -170,8 +170,8 @@ def _fly(args: argparse.Namespace) -> int:
 
     from ..flying import rover, verdict
     from ..flying.mission import Circles, Waypoints
-    from ..flying.sensors import world_of
     from ..flying.trial import Task
+    from ..flying.vehicle import world_of
     from ..flying.verdict import summary, text, wording_of
 
     if args.record is not None:
@@ -215,7 +215,7 @@ def _fly(args: argparse.Namespace) -> int:
 
 def _check_rover(args: argparse.Namespace) -> None:
     """Refuse options that a rover has nothing to do with."""
-    from ..flying.sensors import WORLDS
+    from ..flying.vehicle import WORLDS
 
     for name in NOT_OF_ROVERS:
         if getattr(args, name):

@@ -231,8 +231,7 @@ def config_of(args: Namespace) -> SimulationConfig:
     from uwb_tdoa_bias.common.survey import read_survey
 
     from ..readers.tables import read_numbers
-    from ..simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
-    from ..simulation.rooms import Walls
+    from ..simulation.config import NO_IMU_ERRORS, ImuErrors, SimulationConfig, Walls
 
     values = {
         field.name: getattr(args, field.name)

@@ -88,9 +88,9 @@ def _train(args: Namespace) -> None:
 def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
-    """Train on several Flights, and write all results. over : as in `shrinking.train`."""
+    """Train on several Flights, and write all results. over : as in `models.train_shrunk`."""
     from ..scoring.pooling import gain_in_words
-    from ..training import labels as labelling, models, shrinking
+    from ..training import labels as labelling, models
 
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
@@ -100,7 +100,7 @@ def _write(
     name = args.name or args.model
     progress(f"training on {len(training)} flights, then without each")
     recipe = models.Recipe(args.model, args.seed)
-    result, shrinkage = shrinking.train(
+    result, shrinkage = models.train_shrunk(
         recipe, training, validation, name, progress=cli.show, map_function=over
     )
     args.out.mkdir(parents=True, exist_ok=True)

@@ -14,8 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.effects import EFFECTS, Covariance, Effect, EffectSet
-from uwb_tdoa_bias.effects.covariates import UPWARDS
-from uwb_tdoa_bias.effects.samples import RADIO
+from uwb_tdoa_bias.effects.samples import RADIO, UPWARDS
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from ..parallel import MapFunction

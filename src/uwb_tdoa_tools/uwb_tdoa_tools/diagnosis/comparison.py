@@ -18,11 +18,11 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import VERDICTS
-from uwb_tdoa_ekf.sensitivity import RANGES
+from uwb_tdoa_ekf.smoother import RANGES
 
 from ..cli import as_json
 from ..clock import numbered

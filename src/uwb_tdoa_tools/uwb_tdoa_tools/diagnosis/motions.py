@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
 
 from ..choices import PLAN_SPEED, PLAN_TIME
-from ..simulation.rooms import Room
+from ..simulation.config import Room
 from ..simulation.vehicles import SPEED_UP, STEP
 
 RATE = 20.0  # Hz, of planned poses

@@ -14,12 +14,11 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.core import auxiliary
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
-from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, Innovations, record_innovations
-from uwb_tdoa_ekf.smoother import smooth
+from uwb_tdoa_ekf.smoother import RANGES, TDOAS, Innovations, record_innovations, smooth
 
 from ..choices import NONE
 from ..clock import grid

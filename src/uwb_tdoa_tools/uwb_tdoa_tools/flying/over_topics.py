@@ -26,19 +26,17 @@ from sensor_msgs.msg import Imu
 
 from uwb_tdoa_bias.anchors_node import markers, transforms
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message
 from uwb_tdoa_bias.ros.cdr import CdrCodec, CdrTemplate, message_class
-from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS
 from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput, StreamOutput
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .sensors import World
 from .simulator import DT, Streams
 from .trial import EstimateSource
-from .vehicle import ATTITUDE, POSITION
+from .vehicle import ATTITUDE, POSITION, World
 
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all later turns
 # s of stamps, more than the parameter `lag` of ekf_node: then the filter continues without a stream

@@ -17,10 +17,9 @@ from uwb_tdoa_bias.common.sensors import Stream, Velocity
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
 from .mission import LOST, SPEED, Journey, Polyline, Pose, Rules, yaw_of
-from .sensors import AuxiliarySensor, World, random
 from .simulator import TICK, Simulator
 from .trial import REST_AFTER, Task, Trial, TrialResult
-from .vehicle import GRAVITY, IMU_RATE
+from .vehicle import GRAVITY, IMU_RATE, AuxiliarySensor, World, random
 
 MAST = 0.4  # m
 # parameters of the filter of a rover

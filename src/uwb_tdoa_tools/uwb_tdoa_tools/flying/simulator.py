@@ -15,7 +15,6 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
-from .sensors import AuxiliarySensor, InertialErrors, Radio, World, gusts, random
 from .vehicle import (
     ATTITUDE,
     GRAVITY,
@@ -24,9 +23,15 @@ from .vehicle import (
     STATE,
     STEP,
     VELOCITY,
+    AuxiliarySensor,
+    InertialErrors,
+    Radio,
     Record,
     Vehicle,
+    World,
     ground_at,
+    gusts,
+    random,
     specific_force,
     step,
 )

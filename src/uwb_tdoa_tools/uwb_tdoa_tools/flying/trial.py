@@ -24,9 +24,8 @@ from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
 
 from .controller import SUPPORT_TIME, Controller, rotate_attitude
 from .mission import DONE, REFUSED, Circles, Mission, Pose, Rules, TimedPath, Waypoints
-from .sensors import World, random
 from .simulator import DT, Simulator, Streams, Transport
-from .vehicle import ATTITUDE, IMU_RATE, POSITION
+from .vehicle import ATTITUDE, IMU_RATE, POSITION, World, random
 
 _NO_VECTORS = np.empty((0, 3))
 NO_ODOMETRY = Odometry(

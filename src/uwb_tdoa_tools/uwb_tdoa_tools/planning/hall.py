@@ -25,7 +25,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from .. import parallel
 from ..checking.coverage import sides_of
 from ..parallel import Progress
-from ..simulation.rooms import Room, Walls, facing, heard_at
+from ..simulation.config import Room, Walls, facing, heard_at
 from .maps import TOO_FEW, Chart, Demand, Grid, Judged, judge
 from .precision import UNUSABLE, Installation
 

@@ -23,9 +23,16 @@ from uwb_tdoa_bias.common.flyable import FlyableVolume
 from ..choices import ACCURACY
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
-from ..simulation.rooms import Room
-from .bifurcation import CLEAR, Subsets, other_solutions
-from .precision import Installation, bound, information, position_error
+from ..simulation.config import Room
+from .precision import (
+    CLEAR,
+    Installation,
+    Subsets,
+    bound,
+    information,
+    other_solutions,
+    position_error,
+)
 
 # gives the same items, and prints how many are done
 Wrap = Callable[[Iterable[Any]], Iterable[Any]]

@@ -20,7 +20,7 @@ from uwb_tdoa_bias.common.geometry import ranges
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..parallel import Progress
-from ..simulation.rooms import facing
+from ..simulation.config import facing
 from .hall import Hall
 from .maps import Chart, Demand, Judged, Wrap, judge
 from .precision import (

@@ -25,10 +25,9 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled
 
 from ..scoring.plots import draw_labels
-from ..simulation.rooms import Walls
-from .bifurcation import Subsets
+from ..simulation.config import Walls
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, AccuracyMap, Chart, Grid
-from .precision import Installation, ellipses
+from .precision import Installation, Subsets, ellipses
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour

@@ -22,7 +22,7 @@ from .. import cli, parallel
 from ..choices import OF_PROTOCOL
 from ..parallel import Progress
 from ..readers.inputs import Reading, Recording
-from ..simulation.rooms import Room, Walls, room_of
+from ..simulation.config import Room, Walls, room_of
 from . import maps, optimisation, plots, report
 from .hall import Hall, design, placements, step_of
 from .maps import Chart, Demand, Grid

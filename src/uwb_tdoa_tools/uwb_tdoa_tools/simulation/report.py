@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.common.flight import Flight
 
-from .rooms import CONSTELLATIONS, constellation
+from .config import CONSTELLATIONS, constellation
 from .vehicles import TRAJECTORIES
 
 SUFFIXES = (".png", ".pdf", ".svg")

@@ -17,8 +17,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream, Velocity
 
-from .config import WHEELS_RATE, Complete, ImuErrors
-from .rooms import Room, heard_at
+from .config import WHEELS_RATE, Complete, ImuErrors, Room, heard_at
 from .vehicles import Flyable
 
 SLOT = 2.0e-3  # s, TDOA2: one packet per slot

@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.errors import InputError
 
-from .config import Complete
-from .rooms import REST_HEIGHT, Room
+from .config import REST_HEIGHT, Complete, Room
 
 KNOT = 0.05  # s, spacing of the spline's knots
 SPEED_UP = 2.0  # s, from rest to cruise and back

@@ -25,10 +25,10 @@ from sklearn.neural_network import MLPRegressor
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_bytes, write_filled
-from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.files import temporary_folder, write_bytes, write_filled
+from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
-from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, columns
+from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, Network, columns
 from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, Samples
 
 from ..choices import MODELS
@@ -41,6 +41,9 @@ from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from ..diagnosis.validation import select_by_error
 from ..exporting.onnx_file import GraphBuilder
+from ..parallel import MapFunction
+from ..scoring.evaluation import evaluate
+from ..scoring.pooling import SHARES, Errors, Shrinkage, best_share
 from . import labels as labelling
 from .labels import Labels, by_constellation, labels, with_level_attitude
 
@@ -530,3 +533,99 @@ def plot_curve(
     ax.legend()
     write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)
+
+
+FOLDS = 5
+
+
+def cross_validated(
+    recipe: Recipe,
+    flights: Sequence[Flight],
+    found: Physics | None = None,
+    progress: Callable[[str], object] = lambda text: None,
+    map_function: MapFunction = map,
+) -> Shrinkage:
+    """Return the Shrinkage of a recipe on flights.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    flights : sequence of Flight
+    found : Physics, optional
+        Effects of these flights in this order, for kinds with effects.
+    progress : callable
+        Called with lines of text.
+    map_function : callable
+        Like `map`. It may use other processes.
+    """
+    order = np.random.default_rng(recipe.seed).permutation(len(flights))
+    count = min(FOLDS, len(flights))
+    folds = [order[k::count].tolist() for k in range(count)]
+    rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
+    known = [found and Physics(found.fitted_to(others)) for others in rest]
+    errors: Errors = {
+        flight.name: {None: error} for flight, error in zip(flights, map_function(_error, flights))
+    }
+    for result in map_function(partial(_left_out, recipe, flights), list(zip(folds, rest, known))):
+        for name, by_share in result.items():
+            errors[name] |= by_share
+            progress(
+                f"{name} left out: {errors[name][None]:.3f} m without, {by_share[1.0]:.3f} m with all"
+            )
+    return Shrinkage(best_share(errors), errors)
+
+
+def train_shrunk(
+    recipe: Recipe,
+    training: Sequence[Flight],
+    validation: Sequence[Flight],
+    name: str,
+    progress: Callable[[str], object] = lambda text: None,
+    map_function: MapFunction = map,
+) -> tuple[Trained, Shrinkage]:
+    """Train with `train` and set the share that cross-validation supports.
+
+    Returns
+    -------
+    tuple of Trained and Shrinkage
+    """
+    flights = [*training, *validation]
+    found = None
+    if recipe.kind == "physics":
+        progress("looking for effects")
+        found = find_effects(flights)
+    trained = train(recipe, training, validation, name, progress, found)
+    shrinkage = cross_validated(recipe, flights, found, progress, map_function)
+    if trained.model:
+        trained = replace(trained, meta={**trained.meta, "share": shrinkage.share})
+    return trained, shrinkage
+
+
+def _left_out(
+    recipe: Recipe,
+    flights: Sequence[Flight],
+    fold: tuple[list[int], list[int], Physics | None],
+) -> Errors:
+    """Return the Errors of the flights of a fold by share.
+
+    `fold` holds the numbers of the excluded flights, of the other flights, and their Physics or None.
+    """
+    left_out, others, known = fold
+    some = [flights[k] for k in others]
+    trained = train(recipe, some[:-1] or some, some[-1:], recipe.kind, found=known)
+    with temporary_folder() as folder:
+        model, _ = save(trained, folder)
+        network = Network(model) if model else None
+    errors: Errors = {flights[k].name: {} for k in left_out}
+    for share in SHARES if network else (1.0,):
+        if network:
+            network.share = share
+        for k in left_out:
+            errors[flights[k].name][share] = _error(flights[k], trained.effects, network)
+    return errors
+
+
+def _error(
+    flight: Flight, effects: EffectSet | None = None, network: Network | None = None
+) -> float:
+    return evaluate(flight.without(*SENSOR_NAMES), None, effects, network)[0].row()["rmse_3d"]

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.effects import (
     SmoothTerm,
     Track,
 )
-from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures
+from uwb_tdoa_bias.effects.samples import OF_IMU, ImuFeatures
 
 from ..references import Reference, ReferenceView
 from ..regression.algebra import Matrix

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Imu, Truth
 from uwb_tdoa_bias.effects import ImuSamples
-from uwb_tdoa_bias.effects.covariates import OF_IMU
+from uwb_tdoa_bias.effects.samples import OF_IMU
 from uwb_tdoa_ekf.core.state import GRAVITY
 
 from .base import Comparison

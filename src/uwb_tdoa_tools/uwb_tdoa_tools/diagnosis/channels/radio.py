@@ -19,9 +19,9 @@ from scipy.sparse import csc_array, csr_array
 
 from uwb_tdoa_bias.common.sensors import COMPARED
 from uwb_tdoa_bias.effects import RADIO, Effect, Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_TDOA, ONLY_TDOA
+from uwb_tdoa_bias.effects.samples import CATEGORIES, EXTRA, OF_ARRIVAL, OF_TDOA, ONLY_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
-from uwb_tdoa_ekf.sensitivity import Innovations
+from uwb_tdoa_ekf.smoother import Innovations
 
 from ...checking.pair_rules import MANY
 from ...scoring.phases import in_the_air

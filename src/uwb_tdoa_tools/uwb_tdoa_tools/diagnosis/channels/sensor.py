@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.sensors import COMPARED, STREAM_OF, measured_on
 from uwb_tdoa_bias.effects import Effect, ImuSamples, SensorSamples, SmoothTerm, sensor_samples
-from uwb_tdoa_bias.effects.covariates import OF_SENSORS, sensor_covariate
+from uwb_tdoa_bias.effects.samples import OF_SENSORS, sensor_covariate
 
 from .base import Channel, ChannelResidual, Comparison, Figures, Rows
 from .figures import APART, figures

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import ImuSamples, Samples, SensorSamples
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA
+from uwb_tdoa_bias.effects.samples import CATEGORIES, EXTRA
 
 MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
 OF_EACH = "time", "range"  # covariates of single anchors if there are many anchors

@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 
 from uwb_tdoa_bias.effects import RADIO, SmoothTerm
-from uwb_tdoa_bias.effects.covariates import CATEGORIES, has_domain
+from uwb_tdoa_bias.effects.samples import CATEGORIES, has_domain
 from uwb_tdoa_bias.effects.smooth_term import OF_PLACE, shape_basis
 
 from ..channels.views import CovariateView

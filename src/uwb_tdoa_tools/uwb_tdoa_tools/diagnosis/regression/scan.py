@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.effects import SmoothTerm
-from uwb_tdoa_bias.effects.covariates import CATEGORIES
+from uwb_tdoa_bias.effects.samples import CATEGORIES
 from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
 from ..channels.views import CovariateView

@@ -9,7 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.base import listed
-from uwb_tdoa_bias.effects.covariates import shown_in
+from uwb_tdoa_bias.effects.samples import shown_in
 from uwb_tdoa_bias.effects.smooth_term import described
 
 from ...scoring.pairs import residuals_of

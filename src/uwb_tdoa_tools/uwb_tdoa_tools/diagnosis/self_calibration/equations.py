@@ -3,7 +3,7 @@
 """Normal equations of anchor positions and delays, from flights without ground truth.
 
 A filter run gives innovations and their derivatives by each position and delay, with the path
-marginalized (`uwb_tdoa_ekf/sensitivity.py`). Other systematic errors, from antennas, metal or
+marginalized (`uwb_tdoa_ekf/smoother.py`). Other systematic errors, from antennas, metal or
 floors, are a smooth function of the place for each anchor, also marginalized. It is a Gaussian
 process in random Fourier features (Rahimi and Recht, Random features for large-scale kernel
 machines, NIPS 2007). The evidence selects the sizes of delays and functions (`prior.py`). Where
@@ -30,7 +30,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import FUNCTION_LENGTH, MOVED
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.results import Odometry
-from uwb_tdoa_ekf.sensitivity import TDOAS
+from uwb_tdoa_ekf.smoother import TDOAS
 
 from ...checking.pair_rules import MANY
 from ...parallel import MapFunction
