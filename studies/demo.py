@@ -13,7 +13,7 @@ from uwb_tdoa_tools.diagnosis.report.entries import entries
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.flying import demo
 from uwb_tdoa_tools.scoring.evaluation import score_of
-from uwb_tdoa_tools.scoring.pooling import gain
+from uwb_tdoa_tools.scoring.metrics import gain
 from uwb_tdoa_tools.simulation.inject import hidden_effect
 
 from . import table

@@ -23,8 +23,7 @@ from uwb_tdoa_bias.common.errors import Failure
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.parallel import whole_number
-from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
+from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand, Hall
 from uwb_tdoa_tools.planning.precision import CLEAR, FLIP, FixedNoise, Installation, RadioNoise
 from uwb_tdoa_tools.simulation.config import Room, Walls
 

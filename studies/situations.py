@@ -20,8 +20,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.cli import as_json
-from uwb_tdoa_tools.scoring.metrics import READY, Score
-from uwb_tdoa_tools.scoring.pooling import PooledErrors
+from uwb_tdoa_tools.scoring.metrics import READY, PooledErrors, Score
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import corners, facing
 

@@ -35,8 +35,15 @@ from uwb_tdoa_bias.ros.anchors import (
     same_anchors,
 )
 from uwb_tdoa_bias.ros.cdr import CdrCodec
-from uwb_tdoa_bias.ros.diagnostics import Elapsed, LogFilter, SimulatedClock
-from uwb_tdoa_bias.ros.node import PERIOD, Spinner, StreamNode, StreamPoller
+from uwb_tdoa_bias.ros.node import (
+    PERIOD,
+    Elapsed,
+    LogFilter,
+    SimulatedClock,
+    Spinner,
+    StreamNode,
+    StreamPoller,
+)
 from uwb_tdoa_bias.ros.parameters import BURST, MOST_ASKED, MOST_REQUESTS, REFILL, Log
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch, Streams
 

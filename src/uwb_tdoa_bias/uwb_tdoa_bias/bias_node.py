@@ -42,8 +42,7 @@ from .effects.base import relabelled
 from .effects.tag import TagLeverArm
 from .ros.anchors import ANCHORS_FILE, AnchorsInput, FramesInput, unknown_frame
 from .ros.cdr import CdrCodec, CdrTemplate
-from .ros.diagnostics import Diagnostics, Rate, Report
-from .ros.node import StreamNode, StreamPoller, run
+from .ros.node import Diagnostics, Rate, Report, StreamNode, StreamPoller, run
 from .ros.parameters import (
     FROZEN,
     Parameter,

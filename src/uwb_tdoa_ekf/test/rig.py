@@ -27,7 +27,7 @@ from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.ros.diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.ros.node import DIAGNOSTICS_QOS
 from uwb_tdoa_bias.ros.topics import STREAM_QOS
 from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual

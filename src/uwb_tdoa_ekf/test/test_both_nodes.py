@@ -17,7 +17,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rig import EPOCH, make_shared_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from test_anchor_table import BOX, CHANGE, after, cut, flight_through  # noqa: E402
 
-from uwb_tdoa_bias.ros.diagnostics import AGAIN  # noqa: E402
+from uwb_tdoa_bias.ros.node import AGAIN
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaCorrected  # noqa: E402
 
 pytestmark = pytest.mark.slow  # starts nodes

@@ -30,8 +30,7 @@ from uwb_tdoa_ekf.core.memory import (
 )
 from uwb_tdoa_ekf.core.sensors import STREAMS
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.offline import run_offline, without_offset
-from uwb_tdoa_ekf.pipeline import SLICE, RadioCorrections
+from uwb_tdoa_ekf.offline import SLICE, RadioCorrections, run_offline, without_offset
 from uwb_tdoa_ekf.smoother import smooth
 
 # --- ranges ---

@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rig import STREAMS, Rig, make_rig, seconds_of  # noqa: F401
 from std_srvs.srv import Trigger
 
-from uwb_tdoa_bias.ros.diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.ros.node import DIAGNOSTICS_QOS
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS
 from uwb_tdoa_msgs.msg import EstimatorStatus
 

@@ -23,8 +23,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE, AnchorsInput
-from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
-from uwb_tdoa_bias.ros.node import StreamNode, run
+from uwb_tdoa_bias.ros.node import Diagnostics, Rate, StreamNode, run
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,

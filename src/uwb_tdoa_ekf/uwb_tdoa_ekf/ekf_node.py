@@ -38,8 +38,7 @@ from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros.anchors import AnchorsInput, FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
-from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Elapsed, Report
-from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
+from uwb_tdoa_bias.ros.node import Diagnostics, Elapsed, Report, StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected

@@ -34,7 +34,7 @@ from .core.memory import (
 )
 from .core.startup import APART
 from .monitoring.finding import Finding, Steady, clock_ahead, implausible, restarted
-from .pipeline import Pipeline, PipelineOutput, odometry_of
+from .offline import Pipeline, PipelineOutput, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer, Restart
 from .results import VERDICTS, Odometry, Residuals, concatenated
 

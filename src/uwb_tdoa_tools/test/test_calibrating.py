@@ -37,7 +37,7 @@ from uwb_tdoa_tools.diagnosis.noise import has_imu, write_parameters
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
-from uwb_tdoa_tools.scoring.pooling import NO_DIFFERENCE
+from uwb_tdoa_tools.scoring.metrics import NO_DIFFERENCE
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(

@@ -31,7 +31,7 @@ from uwb_tdoa_tools.diagnosis.report.tables import BASIS, anchors, basis, by_rea
 from uwb_tdoa_tools.diagnosis.report.unclear import CANCELS, by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import cause, left_over, verdict
 from uwb_tdoa_tools.diagnosis.validation import SELECTED_ON
-from uwb_tdoa_tools.scoring.pooling import NO_DIFFERENCE
+from uwb_tdoa_tools.scoring.metrics import NO_DIFFERENCE
 
 # --- artificial findings and diagnoses, and parsed pages ---
 

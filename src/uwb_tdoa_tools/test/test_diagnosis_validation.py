@@ -38,7 +38,7 @@ from uwb_tdoa_tools.diagnosis.validation import (
     select_by_error,
     validation_cases,
 )
-from uwb_tdoa_tools.scoring.pooling import NO_DIFFERENCE
+from uwb_tdoa_tools.scoring.metrics import NO_DIFFERENCE
 
 TRUTH = GroundTruth()
 NONE = EffectSet()

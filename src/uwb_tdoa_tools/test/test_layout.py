@@ -26,7 +26,7 @@ API = {"uwb_tdoa_tools": ("uwb_tdoa",)}
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.ros.anchors uwb_tdoa_bias.ros.cdr
-    uwb_tdoa_bias.ros.diagnostics uwb_tdoa_bias.ros.node
+    uwb_tdoa_bias.ros.node
     uwb_tdoa_bias.ros.parameters
     uwb_tdoa_bias.ros.topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters

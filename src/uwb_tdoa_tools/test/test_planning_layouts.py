@@ -13,13 +13,13 @@ from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.messages import typestore
 from uwb_tdoa_tools.planning import plots
-from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     OUTSIDE,
     TWO_SOLUTIONS,
     Demand,
     Grid,
+    Hall,
 )
 from uwb_tdoa_tools.planning.optimisation import (
     UNUSABLE,

@@ -12,12 +12,12 @@ from scipy.stats import norm
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     TWO_SOLUTIONS,
     Demand,
     Grid,
+    Hall,
     judge,
 )
 from uwb_tdoa_tools.planning.precision import (

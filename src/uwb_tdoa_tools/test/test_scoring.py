@@ -16,7 +16,11 @@ from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run, lines_of_attitude, lines_of_phases
 from uwb_tdoa_tools.scoring.metrics import (
+    ATTITUDE,
+    LOSS,
+    Pool,
     Score,
+    clear_change,
     coverage,
     nees,
     nis,
@@ -26,7 +30,6 @@ from uwb_tdoa_tools.scoring.metrics import (
     summary,
 )
 from uwb_tdoa_tools.scoring.phases import TITLES, in_the_air, motion, phases
-from uwb_tdoa_tools.scoring.pooling import ATTITUDE, LOSS, Pool, clear_change
 
 # --- metrics ---
 

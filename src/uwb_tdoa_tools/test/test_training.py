@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.scoring.pooling import SHARES, Shrinkage, best_share
+from uwb_tdoa_tools.scoring.metrics import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models
 from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
 

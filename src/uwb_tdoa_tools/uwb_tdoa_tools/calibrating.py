@@ -36,7 +36,7 @@ from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
 from .parallel import MapFunction, Progress
 from .readers.inputs import Reading, Recording as ReadingPair
-from .scoring.pooling import NO_DIFFERENCE, change_in_words, clear_change
+from .scoring.metrics import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
 
 RMSE = "3D RMSE"  # name of the figure with ground truth

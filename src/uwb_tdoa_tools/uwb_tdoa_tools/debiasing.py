@@ -30,8 +30,16 @@ from .choices import NONE
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import read_numbers
 from .scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
-from .scoring.metrics import Score, position_at
-from .scoring.pooling import SHARES, Shrinkage, best_share, change_in_words, gain, gain_in_words
+from .scoring.metrics import (
+    SHARES,
+    Score,
+    Shrinkage,
+    best_share,
+    change_in_words,
+    gain,
+    gain_in_words,
+    position_at,
+)
 
 Scored = tuple[Flight, Score, Odometry]  # flight, errors, and estimate
 

@@ -36,9 +36,8 @@ from .scoring.evaluation import (
     estimate_alignment,
     require_truth,
 )
-from .scoring.metrics import Score, radio_residuals
+from .scoring.metrics import Result, Score, radio_residuals
 from .scoring.phases import TITLES
-from .scoring.pooling import Result
 
 COLUMNS = {
     "rmse_x": "x",

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.ros.diagnostics import Rate, Report
+from uwb_tdoa_bias.ros.node import Rate, Report
 
 from .finding import ERROR as SEVERE, Finding
 from .status import LARGEST_UNUSED, Use, flyability

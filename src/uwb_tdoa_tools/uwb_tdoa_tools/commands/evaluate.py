@@ -72,7 +72,7 @@ def parser() -> ArgumentParser:
 def _evaluate(args: Namespace) -> int:
     from .. import evaluating
     from ..evaluating import Evaluator
-    from ..scoring.pooling import Pool
+    from ..scoring.metrics import Pool
 
     if args.odometry:
         options.refuse(

@@ -89,7 +89,7 @@ def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
     """Train on several Flights, and write all results. over : as in `models.train_shrunk`."""
-    from ..scoring.pooling import gain_in_words
+    from ..scoring.metrics import gain_in_words
     from ..training import labels as labelling, models
 
     flights = {flight.name: flight for flight in several}

@@ -27,8 +27,15 @@ from uwb_tdoa_ekf.smoother import RANGES
 from ..cli import as_json
 from ..clock import numbered
 from ..parallel import MapFunction
-from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
-from ..scoring.pooling import NO_DIFFERENCE, clear_change
+from ..scoring.metrics import (
+    EVERYTHING,
+    NO_DIFFERENCE,
+    Score,
+    clear_change,
+    nis,
+    pooled,
+    radio_residuals,
+)
 from .regression.table import BLOCK
 
 Spans = tuple[tuple[float, float], ...]  # (first, last) s

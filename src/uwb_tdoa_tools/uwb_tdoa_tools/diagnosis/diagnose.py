@@ -21,8 +21,7 @@ from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.flight_rules import judge_flight
 from ..parallel import MapFunction
-from ..scoring.metrics import Score, radio_residuals
-from ..scoring.pooling import LOSS, gain
+from ..scoring.metrics import LOSS, Score, gain, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, EffectSearch, residuals_of
 from .channels import CHANNELS, health

@@ -20,8 +20,7 @@ from uwb_tdoa_ekf.offline import Run, run_offline
 from uwb_tdoa_ekf.results import poses_of
 
 from ..parallel import MapFunction
-from ..scoring.metrics import EVERYTHING, Score, rms
-from ..scoring.pooling import LOSS, gain
+from ..scoring.metrics import EVERYTHING, LOSS, Score, gain, rms
 from .attribution import Attribution
 from .comparison import Baseline, ValidationCase, score
 from .detectors import Detection

@@ -36,9 +36,8 @@ from ..diagnosis.result import Diagnosis
 from ..localizing.pictures import write_rerun
 from ..parallel import Progress
 from ..readers.inputs import Reading
-from ..scoring.metrics import Estimate, Score, position_at
+from ..scoring.metrics import Estimate, Score, change_in_words, position_at
 from ..scoring.pairs import PairResiduals, residuals_of
-from ..scoring.pooling import change_in_words
 from ..simulation import SimulationConfig, simulate
 from ..simulation.inject import hidden_effect
 

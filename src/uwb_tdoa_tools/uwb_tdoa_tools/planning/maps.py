@@ -3,29 +3,41 @@
 """Judge places: whether a tag can be flown there, and if not, why.
 
 A place hears too few anchors, is imprecise, has two solutions, or can be flown. Measured flights check
-the precision.
+the precision. In a hall a tag hears the anchors within the radio's reach; a room in which it hears all is a hall with
+an infinite reach.
+
+A design tries regular patterns, from sparse to dense, until the wanted share can be flown.
+`scipy.optimize.minimize` chooses margins, stagger and heights. Then anchors are removed one by
+one while the share can still be flown, and the neighbours of each are moved.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import minimize, minimize_scalar
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.common.flyable import FlyableVolume
 
+from .. import parallel
+from ..checking.coverage import sides_of
 from ..choices import ACCURACY
+from ..parallel import Progress
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
-from ..simulation.config import Room
+from ..simulation.config import Room, Walls, facing, heard_at
 from .precision import (
     CLEAR,
+    UNUSABLE,
     Installation,
     Subsets,
     bound,
@@ -325,3 +337,369 @@ def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, A
         "efficiency_claimed": float(limit / claim),
         "efficiency_achieved": float(limit / squared),
     }
+
+
+PLANE_NEAREST = 10  # anchors that are looked at for a plane through them
+JUDGED_AT_ONCE = 100_000  # times points: anchors that are judged at once, wherever they are
+
+
+@dataclass(frozen=True)
+class Hall:
+    """A hall with walls, and its anchors. It can be pickled.
+
+    installation : Installation; demand : Demand; reach : m; walls : Walls, or None
+    """
+
+    installation: Installation
+    demand: Demand
+    reach: float = np.inf
+    walls: Walls | None = None
+
+    @property
+    def anchors(self) -> Anchors:
+        """The Anchors of the installation."""
+        return self.installation.anchors
+
+    def heard(self, points: np.ndarray) -> list[np.ndarray]:
+        """Return the rows of the anchors that are heard at points (n, 3) m: list of (k,) arrays."""
+        return heard_at(points, self.anchors.positions, self.reach, self.walls)
+
+    def chart(self, grid: Grid, jobs: int | None = None, dask: str | None = None) -> Chart:
+        """Return the Chart of a Grid. jobs, dask : as for `parallel.over`."""
+        points = grid.points
+        tiles = self._tiles(points)
+        unit = "part of the hall" if len(tiles) > 1 else "map"
+        parts = [points[cells] for cells in tiles]
+        whole = self.unheard(points)
+        heard = np.zeros(len(points), int)
+        results = parallel.over(self.judge, parts, jobs, dask, unit)
+        for cells, (found, counts) in zip(tiles, results):
+            whole.assign(cells, found)
+            heard[cells] = counts
+        return Chart(whole.covariance, whole.error, whole.status, grid, heard)
+
+    def judge(self, points: np.ndarray) -> tuple[Judged, np.ndarray]:
+        """Return (Judged, number of anchors heard (n,)) of points (n, 3) m.
+
+        Points near each other hear the same few anchors, which limits time and memory. Points with
+        too few anchors stay `unheard`.
+        """
+        if self.reach == np.inf and self.walls is None:
+            found = judge(points, self.installation, self.demand)
+            return found, np.full(len(points), len(self.anchors))
+        heard = self.heard(points)
+        counts = np.array([len(rows) for rows in heard], int)
+        whole = self.unheard(points)
+        heard_somewhere = np.unique(np.concatenate([np.empty(0, int), *heard]))
+        # Points with the same number of anchors are judged at once.
+        for count in np.unique(counts[counts > self.installation.unknowns]):
+            cells = np.flatnonzero(counts == count)
+            installation = self.installation.with_anchors(self.anchors.only(heard_somewhere))
+            columns = np.searchsorted(heard_somewhere, np.stack([heard[cell] for cell in cells]))
+            whole.assign(cells, judge(points[cells], installation, self.demand, columns))
+        return whole, counts
+
+    def _tiles(self, points: np.ndarray) -> list[np.ndarray]:
+        """Return the rows of points (n, 3) m that are near each other: list of (k,) arrays.
+
+        It is one array if there are few points and anchors, or if all anchors are heard.
+        """
+        few = len(points) * len(self.anchors) <= JUDGED_AT_ONCE
+        if few or self.reach == np.inf:
+            return [np.arange(len(points))]
+        size = max(0.5 * self.reach, 1e-3)
+        at = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / size).astype(int)
+        _, tile = np.unique(at, axis=0, return_inverse=True)
+        order = np.argsort(tile.ravel(), kind="stable")
+        return np.split(order, np.flatnonzero(np.diff(tile.ravel()[order])) + 1)
+
+    def unheard(self, points: np.ndarray) -> Judged:
+        """Return the Judged of points (n, 3) m that hear no anchor."""
+        n, k = len(points), self.installation.dimensions
+        return Judged(np.full((n, k, k), np.inf), np.full(n, np.inf), np.full(n, TOO_FEW))
+
+    def with_anchors(self, anchors: Anchors) -> Hall:
+        """Return the same Hall with other Anchors."""
+        return replace(self, installation=self.installation.with_anchors(anchors))
+
+    def changed(
+        self, before: Judged, points: np.ndarray, anchors: Anchors, places: np.ndarray
+    ) -> Judged:
+        """Return the Judged of points (n, 3) m with other Anchors.
+
+        before : Judged with the anchors of this Hall; places : (m, 3) m, the only places at which they differ.
+        """
+        away = np.min(np.linalg.norm(points[:, None] - places, axis=2), axis=1)
+        near = np.flatnonzero(away <= self.reach)
+        whole, other = before.subset(np.arange(len(points))), self.with_anchors(anchors)
+        for cells in self._tiles(points[near]) if len(near) else ():
+            whole.assign(near[cells], other.judge(points[near[cells]])[0])
+        return whole
+
+    def everywhere(self, points: np.ndarray) -> Judged:
+        """Return the Judged of points (n, 3) m all over a hall."""
+        return self.changed(self.unheard(points), points, self.anchors, self.anchors.positions)
+
+    def side(self, points: np.ndarray) -> dict[str, Any] | None:
+        """Return where the heard anchors lie in a plane: {"share": of points, "tag_side": values}.
+
+        The tag's side must be given there. points : (n, 3) m. None if there is no such point, or if the
+        height is known and the anchors have one height.
+        """
+        needed = []
+        unknowns = self.installation.unknowns
+        for point, rows in zip(points, self.heard(points)):
+            if len(rows) <= unknowns:
+                continue
+            positions = self.anchors.positions[rows]
+            nearest = np.argsort(np.linalg.norm(positions - point, axis=1))[:PLANE_NEAREST]
+            sides = sides_of(positions[nearest])
+            if len(sides) == 2 or (sides and unknowns == 3):
+                needed.append(sides)
+        if not needed:
+            return None
+        most = max(sorted(set(needed)), key=needed.count)
+        return {"share": needed.count(most) / len(points), "tag_side": list(most)}
+
+
+# margins, stagger and heights of the first pattern, see `_pattern`
+FIRST = (0.4, 0.4, 0.1, 0.1, 0.85)
+LOWEST = 0.5  # m above the floor, of an anchor
+# of the reach: the first spacing, the densest, and the ratio of each to the one before
+SPACINGS = (1.2, 0.25, 0.88)
+MOST = 400  # anchors of a pattern that is tried
+SEARCH_CELLS = 500  # places that a search looks at
+# of the logarithm of the bound, over which a place turns from precise to imprecise while a search
+# goes on
+SOFT = 0.15
+FINE = 0.02  # weight of the mean logarithm of the bound beside the share
+TRIALS = 60  # layouts of one pattern
+MOVES = 40  # places of an anchor that is moved
+TURNS = 10  # directions of an anchor
+MOVED = 3  # neighbours of an anchor that is taken away
+FARTHEST = 4.0  # m that they are moved by, along each axis
+
+
+def step_of(found: Judged, anchors: Anchors, room: Room) -> dict[str, Any]:
+    """Return {"count", "spacing", "share", "median", "most"} of Judged places: a step of a search.
+
+    count : anchors; spacing : m, root of the area over their number; share : that can be flown;
+    median, most : m, median and 95 % of the bound there, None if there is none.
+    """
+    errors = found.error[found.flyable]
+    size = room.upper - room.lower
+    median, most = np.quantile(errors, [0.5, 0.95]).tolist() if len(errors) else (None, None)
+    return {
+        "count": len(anchors),
+        "spacing": float(np.sqrt(size[0] * size[1] / len(anchors))),
+        "share": float(found.flyable.mean()),
+        "median": median,
+        "most": most,
+    }
+
+
+def design(
+    hall: Hall, points: np.ndarray, share: float, progress: Progress
+) -> tuple[list[Anchors], list[dict[str, Any]]]:
+    """Return (layouts, steps) of the room of a Hall: Anchors, the fewest first, and `step_of` tries.
+
+    points : (n, 3) m, the cells to be flown; hall : Hall, without its anchors. Raises
+    InputError if no pattern gives that share.
+    """
+    points = points[np.sort(np.random.default_rng(0).permutation(len(points))[:SEARCH_CELLS])]
+    room, quick = hall.demand.room, _quick(hall)
+    steps: list[dict[str, Any]] = []
+    anchors: Anchors | None = None
+    x = np.array(FIRST)
+    for columns, rows in _patterns(room, hall.reach):
+        progress(f"layouts of {columns} x {rows} anchors")
+        x = _best_pattern(quick, points, columns, rows, x)
+        found = _pattern(room, columns, rows, x)
+        judged = hall.with_anchors(found).everywhere(points)
+        steps.append(step_of(judged, found, room))
+        if anchors is not None:
+            break  # one pattern more, to say what it costs
+        if judged.flyable.mean() >= share:
+            anchors = found
+    if anchors is None:
+        most = max(steps, key=lambda step: step["share"])
+        raise InputError(
+            f"share: {100.0 * share:.0f} % of the hall cannot be flown at an accuracy of "
+            f"{hall.demand.accuracy:g} m; {most['count']} "
+            f"anchors give {100.0 * most['share']:.0f} %. Give a larger --accuracy, a smaller "
+            "--share, or a known height (--planar, --with height)."
+        )
+    layouts, more = _without_spare_anchors(hall, points, share, anchors, progress)
+    progress("directions of the anchors")
+    turned = [_with_best_yaws(quick, points, each) for each in layouts[:2]]
+    return turned + layouts[2:], _best_steps(steps + more)
+
+
+def _best_steps(steps: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the steps with a larger share than all with fewer anchors, the fewest first."""
+    out: list[dict[str, Any]] = []
+    for step in sorted(steps, key=lambda step: (step["count"], -step["share"])):
+        if not out or step["share"] > out[-1]["share"]:
+            out.append(step)
+    return out
+
+
+def _patterns(room: Room, reach: float) -> list[tuple[int, int]]:
+    """Return the (columns, rows) of patterns, from sparse to dense."""
+    first, last, ratio = SPACINGS
+    size = room.upper - room.lower
+    least = min(reach, float(size[:2].max()))
+    spacing = first * least
+    out: list[tuple[int, int]] = []
+    while spacing > last * least:
+        columns, rows = (max(2, round(side / spacing)) for side in size[:2])
+        if columns * rows <= MOST and (columns, rows) not in out:
+            out.append((columns, rows))
+        spacing *= ratio
+    return out
+
+
+def _pattern(room: Room, columns: int, rows: int, x: np.ndarray) -> Anchors:
+    """Return the Anchors of a pattern.
+
+    x : (5,) from 0 to 1: margins along x and y, up to half a pitch; stagger of each second row, up to
+    a quarter; heights of the two halves of the anchors, which alternate.
+    """
+    size, (i, j) = room.upper - room.lower, np.indices((columns, rows)).reshape(2, -1)
+    pitch = size[:2] / (np.array([columns, rows]) - 1 + x[:2])
+    across = np.column_stack([i, j]) * pitch + 0.5 * x[:2] * pitch
+    across[:, 0] += np.where(j % 2 == 1, 0.25, -0.25) * x[2] * pitch[0]
+    height = LOWEST + np.where((i + j) % 2 == 0, x[3], x[4]) * max(size[2] - LOWEST, 0.0)
+    return _facing(np.column_stack([np.clip(across, 0.0, size[:2]), height]) + room.lower, room)
+
+
+def _facing(positions: np.ndarray, room: Room) -> Anchors:
+    return facing(positions.round(1), room.centre)
+
+
+def _best_pattern(
+    quick: Hall, points: np.ndarray, columns: int, rows: int, start: np.ndarray
+) -> np.ndarray:
+    """Return x of the best `_pattern`, from a start."""
+    room = quick.demand.room
+
+    def cost(x: np.ndarray) -> float:
+        pattern = _pattern(room, columns, rows, np.clip(x, 0.0, 1.0))
+        return _cost_of(quick.with_anchors(pattern).everywhere(points), quick)
+
+    simplex = np.vstack([start, start + np.where(start < 0.5, 0.3, -0.3) * np.eye(len(start))])
+    found = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        bounds=[(0.0, 1.0)] * len(start),
+        options={"maxfev": TRIALS, "initial_simplex": simplex},
+    )
+    return np.clip(found.x, 0.0, 1.0)
+
+
+def _cost_of(found: Judged, quick: Hall) -> float:
+    """Return the cost: a smooth share of imprecise places, and a little of the bound."""
+    log = np.log(np.minimum(found.error, UNUSABLE))
+    return float(np.mean(expit((log - np.log(quick.demand.accuracy)) / SOFT)) + FINE * log.mean())
+
+
+def _without_spare_anchors(
+    hall: Hall, points: np.ndarray, share: float, anchors: Anchors, progress: Progress
+) -> tuple[list[Anchors], list[dict[str, Any]]]:
+    """Return layouts with fewer and fewer anchors, and the step of each try.
+
+    Each layout still has the wanted share. The fewest come first.
+    """
+    layouts, steps, quick = [anchors], [], _quick(hall)
+    while len(anchors) > hall.installation.unknowns + 1:
+        progress(f"layouts of {len(anchors) - 1} anchors")
+        now = quick.with_anchors(anchors).everywhere(points)
+        costs = []
+        for row in range(len(anchors)):
+            judged = quick.changed(now, points, _less(anchors, row), anchors.positions[[row]])
+            costs.append(_cost_of(judged, quick))
+        gone = int(np.argmin(costs))
+        fewer = _less(anchors, gone)
+        away = np.linalg.norm(fewer.positions - anchors.positions[gone], axis=1)
+        for row in np.argsort(away)[:MOVED]:
+            fewer = _moved(quick, points, fewer, int(row))
+        judged = hall.with_anchors(fewer).everywhere(points)
+        steps.append(step_of(judged, fewer, hall.demand.room))
+        if judged.flyable.mean() < share:
+            break
+        anchors = fewer
+        layouts.insert(0, anchors)
+    return layouts, steps
+
+
+def _less(anchors: Anchors, row: int) -> Anchors:
+    """Return the Anchors without one."""
+    return anchors.only(np.delete(np.arange(len(anchors)), row))
+
+
+def _quick(hall: Hall) -> Hall:
+    """Return the same Hall, judged without second solutions."""
+    return replace(hall, demand=replace(hall.demand, quick=True))
+
+
+def _moved(quick: Hall, points: np.ndarray, anchors: Anchors, row: int) -> Anchors:
+    """Return Anchors with one moved to the least cost nearby."""
+    start, room = anchors.positions[row], quick.demand.room
+    lowest = [0.0, 0.0, min(LOWEST, (room.upper - room.lower)[2])]
+    low = np.maximum(start - FARTHEST, room.lower + lowest)
+    high = np.minimum(start + FARTHEST, room.upper)
+    now = quick.with_anchors(anchors).everywhere(points)
+
+    def at(place: np.ndarray) -> Anchors:
+        positions = anchors.positions.copy()
+        positions[row] = place
+        return _facing(positions, room)
+
+    def cost(place: np.ndarray) -> float:
+        judged = quick.changed(now, points, at(place), np.stack([start, place]))
+        return _cost_of(judged, quick)
+
+    # half-way to the farther bound along each axis
+    steps = np.where(high - start >= start - low, high - start, low - start)
+    simplex = np.vstack([start, start + 0.5 * np.diag(steps)])
+    options = {"maxfev": MOVES, "initial_simplex": simplex}
+    bounds = list(zip(low, high))
+    found = minimize(cost, start, method="Nelder-Mead", bounds=bounds, options=options)
+    return at(found.x) if found.fun < cost(start) else anchors
+
+
+def _with_best_yaws(quick: Hall, points: np.ndarray, anchors: Anchors) -> Anchors:
+    """Return Anchors, each turned about the vertical to the least cost."""
+    for row in range(len(anchors)):
+        anchors = _turned(quick, points, anchors, row)
+    return anchors
+
+
+def _turned(quick: Hall, points: np.ndarray, anchors: Anchors, row: int) -> Anchors:
+    """Return Anchors with one turned about the vertical to the least cost."""
+    now = quick.with_anchors(anchors).everywhere(points)
+
+    def at(yaw: float) -> Anchors:
+        orientations = anchors.orientations.copy()
+        orientations[row] = Rotation.from_euler("z", yaw, degrees=True).as_quat().round(4)
+        return Anchors(anchors.ids, anchors.positions, orientations, anchors.frame)
+
+    def cost(yaw: float) -> float:
+        judged = quick.changed(now, points, at(yaw), anchors.positions[[row]])
+        return _cost_of(judged, quick)
+
+    options = {"maxiter": TURNS}
+    found = minimize_scalar(cost, bounds=(-180.0, 180.0), method="bounded", options=options)
+    return at(round(float(found.x))) if found.fun < _cost_of(now, quick) else anchors
+
+
+def placements(anchors: Anchors) -> list[dict[str, Any]]:
+    """Return [{"id", "position" m, "yaw" degrees}] of Anchors that stand upright."""
+    yaws = Rotation.from_quat(anchors.orientations).as_euler("ZYX", degrees=True)[:, 0].round()
+    return [
+        {"id": number, "position": position, "yaw": yaw}
+        for number, position, yaw in zip(
+            anchors.ids.tolist(), anchors.positions.tolist(), yaws.tolist()
+        )
+    ]

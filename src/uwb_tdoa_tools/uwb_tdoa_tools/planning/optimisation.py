@@ -21,8 +21,7 @@ from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..parallel import Progress
 from ..simulation.config import facing
-from .hall import Hall
-from .maps import Chart, Demand, Judged, Wrap, judge
+from .maps import Chart, Demand, Hall, Judged, Wrap, judge
 from .precision import (
     UNUSABLE,
     Installation,

@@ -17,7 +17,7 @@ from ..bags.files import new_bag
 from ..bags.messages import anchors_message, header_of, pose_of, typestore
 from ..bags.topics import LATCHED_QOS
 from ..checking.coverage import to_copy
-from ..scoring.pooling import change_in_words
+from ..scoring.metrics import change_in_words
 from ..simulation.config import Room
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS, Chart, Grid
 from .precision import NORMAL_99, Installation, dilution

@@ -24,8 +24,7 @@ from ..parallel import Progress
 from ..readers.inputs import Reading, Recording
 from ..simulation.config import Room, Walls, room_of
 from . import maps, optimisation, plots, report
-from .hall import Hall, design, placements, step_of
-from .maps import Chart, Demand, Grid
+from .maps import Chart, Demand, Grid, Hall, design, placements, step_of
 from .optimisation import AnchorPlaces, Goal, lattice
 from .precision import FixedNoise, Installation, RadioNoise, antenna_from_yaml
 

@@ -43,7 +43,7 @@ from ..diagnosis.validation import select_by_error
 from ..exporting.onnx_file import GraphBuilder
 from ..parallel import MapFunction
 from ..scoring.evaluation import evaluate
-from ..scoring.pooling import SHARES, Errors, Shrinkage, best_share
+from ..scoring.metrics import SHARES, Errors, Shrinkage, best_share
 from . import labels as labelling
 from .labels import Labels, by_constellation, labels, with_level_attitude
 

@@ -16,8 +16,8 @@ from uwb_tdoa_bias.effects.smooth_term import described, in_brief
 from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
 from ...readers.streams import protocol
+from ...scoring.metrics import LOSS, NO_DIFFERENCE, clear_change, gain
 from ...scoring.phases import NEAR_THE_FLOOR, TITLES
-from ...scoring.pooling import LOSS, NO_DIFFERENCE, clear_change, gain
 from ..channels import ChannelResidual
 from ..channels.figures import rows_by_value
 from ..findings import prefixes_of
