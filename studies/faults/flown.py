@@ -3,7 +3,8 @@
 """fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate, with a fault in its
 streams.
 
-It obeys `status`: it sinks while `status` is not "running". The study runs in lockstep, without
+It obeys `status`: it sinks while `status` is not "running". It sinks while the odometry is older
+than `autopilot_node` sends, too. The study runs in lockstep, without
 ROS. A fault lasts from 12 to 15 s after switching on, in the first circle.
 """
 
@@ -21,6 +22,7 @@ from uwb_tdoa_ekf.monitoring.status import FAULT, RUNNING, Use, status_of
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamWatch
 from uwb_tdoa_ekf.results import concatenated, rotation_std, rows_of
 from uwb_tdoa_tools import cli
+from uwb_tdoa_tools.autopilot.estimate import OLDEST
 from uwb_tdoa_tools.flying.simulator import Streams
 from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial
 from uwb_tdoa_tools.flying.vehicle import world_of
@@ -206,8 +208,10 @@ class FaultyFilter:
 
     @property
     def deviation(self) -> float:
-        """m, inf where `status` is not "running"."""
-        return math.inf if self.why else self._ours.deviation
+        """m, inf where `status` is not "running", and where the odometry is old by its stamp."""
+        newest = self._ours.newest
+        old = newest is not None and self._now - newest.t[-1] > OLDEST
+        return math.inf if self.why or old else self._ours.deviation
 
     @property
     def odometry(self) -> Any:
