@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import dis
 from functools import partial, reduce
 import json
 import math
@@ -420,7 +421,8 @@ def _python_of(kernel: Any) -> Callable[..., Any]:
     """Return the Python function of a compiled one, with functions of symbols for its own."""
     plain = getattr(kernel, "py_func", kernel)
     own = {}
-    for name in plain.__code__.co_names:
+    loaded = (one.argval for one in dis.get_instructions(plain) if one.opname == "LOAD_GLOBAL")
+    for name in loaded:  # co_names would hold attributes too
         value = plain.__globals__.get(name)
         called = getattr(value, "py_func", value)
         if isinstance(called, FunctionType) and called.__module__.startswith("uwb_tdoa"):
