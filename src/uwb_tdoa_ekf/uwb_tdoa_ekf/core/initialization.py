@@ -135,7 +135,7 @@ def start(
 
     There are three starts. A tag at rest on the ground starts at the most probable place there. A
     tag at rest elsewhere starts without velocity. A moving tag starts with the velocity that
-    its TDOAs give, at one or two places. If the ground is more probable, and TDOAs are too noisy to
+    its TDOAs give, at one or two places. If the ground is likely, and TDOAs are too noisy to
     show rest, the tag waits for the timeout. Then it starts on the ground.
 
     Parameters
@@ -170,8 +170,10 @@ def start(
         ekf, pairs, anchors, parameters, known, rest_x, rest_covariance
     )
     motion = ground.judge_motion(pairs, anchors, rest_x, ekf.still_covariance)
-    still, likely = motion == ground.STILL, motion != ground.MOVES and ground_log_odds > 0.0
-    on_ground = ground_log_odds > stationary_position.DECISIVE or (likely and (still or timed_out))
+    still = motion == ground.STILL
+    likely = motion != ground.MOVES and ground_log_odds > stationary_position.LIKELY
+    on_ground = ground_log_odds > (0.0 if still else stationary_position.DECISIVE)
+    on_ground |= likely and timed_out
     accepted = (
         still
         if on_ground or likely

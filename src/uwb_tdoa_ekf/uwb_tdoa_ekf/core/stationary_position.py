@@ -35,6 +35,7 @@ UNUSUAL = 3.0  # and that anchors are late by an unknown amount because they are
 REACH = 1.0  # m from the place where the lateness of anchors is known, over which echoes change
 # log probability ratio by which the ground must exceed the state of the filter for a landing
 DECISIVE = 6.0
+LIKELY = 3.0  # the same, 20 to 1: a noisy start waits with the ground
 HOVER_STD = 0.3  # m, of the position of a tag that seems to stand but may hover
 # expected number of anchors that are late because the tag is low, if its TDOAs change
 FEWEST_LATE = 1.5
