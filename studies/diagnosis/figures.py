@@ -19,7 +19,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.surveying.report import with_blocked
 
 from .. import table
-from . import bank, blind, measured, splits
+from . import bank, blind, measured, splits, unlisted
 
 
 def add_options(add):
@@ -52,6 +52,11 @@ def _blind(args):
         clean = list(blind.false_alarms(args.draws, args.first))
         figures["false alarms"] = bank.share(bool(r["said"]) for r in clean)
     return figures
+
+
+def _unlisted(args):
+    cases = [(kind, seed) for kind in unlisted.KINDS for seed in table.seeds(args)]
+    return unlisted.figures(list(table.results(unlisted.run, cases, args)))
 
 
 def _costly(args, function):
@@ -121,6 +126,7 @@ PARTS = {
     "bank": _bank,
     "sensors": partial(_bank, aided=True),
     "blind": _blind,
+    "unlisted": _unlisted,
     "measured": _measured,
     "measured-sensors": partial(_measured, names=measured.AIDED, sensors=SENSOR_NAMES),
     "rows": _rows,

@@ -56,6 +56,17 @@ def test_residuals_of_a_clean_flight_are_its_noise(parts):
     assert 1.4826 * np.median(np.abs(tdoa.residual[tdoa.airborne])) == pytest.approx(0.06, rel=0.05)
 
 
+@pytest.mark.slow
+def test_noise_of_motion_capture_is_no_scale_of_the_accelerometer():
+    """A millimetre is 0.2 m/s^2 in second differences: slopes of -5 to -10 % on the true force."""
+    flight = clean_flight(101, 40.0)
+    noise = np.random.default_rng(1).normal(0.0, 1e-3, flight.truth.p.shape)
+    flight = replace(flight, truth=replace(flight.truth, p=flight.truth.p + noise))
+    part = residuals(flight, GroundTruth(), EffectSet())["accel"]
+    for force, error in zip(part.samples.reading.T[:2], part.residual.T):
+        assert abs(np.polyfit(force, error, 1)[0]) < 0.02
+
+
 def test_features_of_inertial_samples_are_computed_once_for_all_channels(monkeypatch):
     made = []
 

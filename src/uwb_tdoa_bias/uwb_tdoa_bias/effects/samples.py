@@ -282,8 +282,8 @@ class ImuSamples:
 
     channel : "gyro" or "accel"
     t : (n,) s; p : (n, 3) m, world; start : s, as of Samples
-    reading : (n, 3) true value, body. For the gyroscope it is the measured one, which is less
-        noisy: noise in a regressor shrinks the estimate.
+    reading : (n, 3) measured value, body. The true one is noisier: noise in a regressor shrinks
+        the estimate, and noise that the residual shares looks like a scale.
     time_derivative : (n, 3) derivative of the reading by time, per s, or None
     up : (n, 3) vertical of the world, body
     features : (n, len(OF_IMU)) covariates; motion : Motion
@@ -602,7 +602,7 @@ def sensor_covariate(name: str, samples: ImuSamples | SensorSamples) -> np.ndarr
             return None
         return (samples.extra or {}).get(name.removeprefix(EXTRA))
     if samples.channel == "accel" and name in OF_ACCEL:
-        # The true force: the measured one shares its noise with the residual.
+        # of the cell of the residual; the features are of the past
         reading = samples.reading
         return _norm(reading) if name == "accel" else reading[:, "xyz".index(name[-1])]
     if name in OF_IMU and isinstance(samples, ImuSamples):

@@ -180,7 +180,7 @@ class Accel(Inertial):
         world = Rotation.from_quat(track.attitudes(imu.t[flown])).apply(imu.accel[flown])
         measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
         features = means(imu.t, comparison.imu_features, edges)
-        samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
+        samples = self._samples(comparison, middles, measured, 0.5 * (features[1:] + features[:-1]))
         measured = measured - comparison.effects.uncorrected(samples)
         return AxesResidual(samples, measured - true, self.labels, self.unit)
 
