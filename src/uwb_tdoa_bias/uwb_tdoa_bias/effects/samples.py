@@ -282,8 +282,8 @@ class ImuSamples:
 
     channel : "gyro" or "accel"
     t : (n,) s; p : (n, 3) m, world; start : s, as of Samples
-    reading : (n, 3) measured value, body. The true one is noisier: noise in a regressor shrinks
-        the estimate, and noise that the residual shares looks like a scale.
+    reading : (n, 3) value that effects are functions of, body: the measured rate, which is less
+        noisy than the true one, or a force whose noise the residual does not share
     time_derivative : (n, 3) derivative of the reading by time, per s, or None
     up : (n, 3) vertical of the world, body
     features : (n, len(OF_IMU)) covariates; motion : Motion

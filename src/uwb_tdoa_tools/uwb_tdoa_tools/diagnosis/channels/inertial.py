@@ -180,9 +180,31 @@ class Accel(Inertial):
         world = Rotation.from_quat(track.attitudes(imu.t[flown])).apply(imu.accel[flown])
         measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
         features = means(imu.t, comparison.imu_features, edges)
-        samples = self._samples(comparison, middles, measured, 0.5 * (features[1:] + features[:-1]))
+        force = _apart(measured, true, comparison.poses)
+        samples = self._samples(comparison, middles, force, 0.5 * (features[1:] + features[:-1]))
         measured = measured - comparison.effects.uncorrected(samples)
         return AxesResidual(samples, measured - true, self.labels, self.unit)
+
+
+def _apart(measured: np.ndarray, true: np.ndarray, truth: Truth) -> np.ndarray:
+    """Return forces (n, 3), m/s^2, whose noise is not that of `measured - true`, both (n, 3).
+
+    Noise that a regressor shares with the residual looks like a scale. The mean that is weighted by
+    inverse variances shares none (Deming 1943). Third differences of the Truth show the noise of a
+    position, changes of the residual from cell to cell show the noise of both.
+    """
+    of_position = float(_spread(np.diff(truth.p, 3, axis=0).ravel())) ** 2 / 20.0
+    both = _spread(np.diff(measured - true, axis=0)) ** 2
+    of_true = np.minimum(of_position / CELL**4, both / 20.0)
+    of_measured = np.maximum((both - 20.0 * of_true) / 1.5, 1e-12)
+    share = 6.0 * of_true / (6.0 * of_true + of_measured)
+    return share * measured + (1.0 - share) * true
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """Return robust standard deviations of the columns of values."""
+    spread: np.ndarray = 1.4826 * np.median(np.abs(values), axis=0)
+    return spread
 
 
 def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
