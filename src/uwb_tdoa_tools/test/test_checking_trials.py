@@ -111,14 +111,14 @@ def test_surveys_of_one_room_are_named_together(healthy):
             wrong, [("monday.yaml", healthy.anchors), ("tuesday.yaml", by_millimetres)]
         )
     )
-    assert len(trials) == 1 and "monday.yaml or tuesday.yaml" in trials[0].finding(0.5, 9.0).cause
+    assert len(trials) == 1 and "monday.yaml or tuesday.yaml" in trials[0].finding.cause
     assert list(tdoa_rules.other_survey(healthy, [("monday.yaml", by_millimetres)])) == []
 
 
 def test_ids_are_not_tried_without_motion():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
     assert second_principal_std(hovering.survey_fit.places) < LEAST_MOTION
-    assert [trial.rule for trial in tdoa_rules.judged(hovering)] == ["tdoa_sign"]
+    assert [trial.finding.rule for trial in tdoa_rules.judged(hovering)] == ["tdoa_sign"]
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -206,7 +206,7 @@ def test_a_turn_about_the_vertical_cannot_be_seen(healthy):
     ],
 )
 def test_the_remedy_is_the_matrix_in_words(accel, gyro, words):
-    assert imu_rules._finding(imu_rules.Arrangement(0.5, 9.0, accel, gyro), "").remedy == words
+    assert imu_rules._finding(accel, gyro).remedy == words
 
 
 # --- checking ordered ---

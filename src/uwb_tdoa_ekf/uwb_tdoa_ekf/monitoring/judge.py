@@ -171,7 +171,7 @@ class Judge:
         close = self._units_near(found.factor)
         mean = losses.mean(axis=0)
         named = self._hypotheses[min(close, key=lambda k: mean[k], default=best)]
-        return _of_scale(named.name, named.factor, evidence)
+        return wrong_scale(named.name, named.factor, evidence)
 
     @property
     def exchange(self) -> tuple[int, ...]:
@@ -238,7 +238,7 @@ class Judge:
         return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
 
-def wrong_sign(evidence: str, value: float) -> Finding:
+def wrong_sign(evidence: str, value: float = math.nan) -> Finding:
     """Return the Finding that the sign of all TDOAs is wrong."""
     return Finding(
         "tdoa_sign",
@@ -267,7 +267,7 @@ def exchanged(table: dict[int, int], evidence: str, value: float = math.nan) -> 
     )
 
 
-def _of_scale(name: str, factor: float, evidence: str) -> Finding:
+def wrong_scale(name: str, factor: float, evidence: str) -> Finding:
     """Return the Finding on a survey that is too large by a factor, the unit `name` or "".
 
     With a factor near NANOSECONDS, the TDOAs are in another unit, not the survey.
@@ -283,24 +283,18 @@ def _of_scale(name: str, factor: float, evidence: str) -> Finding:
             ),
             value=NANOSECONDS,
         )
-    cause, remedy = wrong_unit(name, factor)
+    size = f"{factor:,.5g} times too large"
     if not name:
-        size = f"{factor:.3g} times too large"
-        if factor < 1.0:
-            size = f"{1.0 / factor:.3g} times too small"
-        cause = f"the survey is not in metres: its positions are about {size}"
+        size = f"about {max(factor, 1.0 / factor):.3g} times too {'large' if factor > 1.0 else 'small'}"
+    unit = f"in {name}, not" if name else "not"
     return Finding(
-        "survey_scale", ERROR, cause=cause, evidence=evidence, remedy=remedy, value=factor
+        "survey_scale",
+        ERROR,
+        cause=f"the survey is {unit} in metres: its positions are {size}",
+        evidence=evidence,
+        remedy=f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor",
+        value=factor,
     )
-
-
-def wrong_unit(name: str, factor: float) -> tuple[str, str]:
-    """Return (cause, remedy) of a survey in another unit, whose positions are too large."""
-    cause = (
-        f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
-    )
-    line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
-    return cause, line
 
 
 def _hypotheses(doubtful: Sequence[int]) -> list[Hypothesis]:

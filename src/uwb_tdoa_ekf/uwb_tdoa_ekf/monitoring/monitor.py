@@ -31,6 +31,7 @@ from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
 from .change import Change, ChangeDetector
 from .finding import WARNING, Finding
+from .inertial_rules import AXES
 from .judge import exchanged
 from .reference import Displaced, SurveyComparison
 from .slices import LENGTH, Slice, reduced, turned
@@ -72,9 +73,9 @@ TURN_APART = 3.0  # s of stamps between two sign flips of all TDOAs
 # permanently look as if they had the other sign.
 MOST, AGREED = 0.5, 1.1
 MOST_EVENTS = 1000  # events that are stored
-CALIBRATE = 15.0  # s in motion over which the reference for the IMU biases is averaged
-# {sensor: (change of an estimated bias that is reported, unit)}, in the order of `_follow_biases`
-BIAS_LIMITS = {"gyroscope": (0.03, "rad/s"), "accelerometer": (0.6, "m/s^2")}
+CALIBRATE = 15.0  # s in motion after which the IMU biases are the reference
+# change of an estimated bias that is reported, and its unit, for each of AXES
+BIAS_LIMITS = [(0.03, "rad/s")] * 3 + [(0.6, "m/s^2")] * 3
 
 SURVEYING = "survey RECORDING"  # command that estimates anchor positions
 
@@ -178,10 +179,8 @@ class Monitor:
         # another order, or none, that slices suggest instead, and how many consecutive ones
         self._instead: tuple[Order, int] = ((), 0)
         self._moving_since = math.nan  # s, stamp of the first motion
-        # (6,) biases of gyroscope, rad/s, and accelerometer, m/s^2, body: reference, and the latest
-        self._bias_reference: np.ndarray | None = None
-        self._bias_now: np.ndarray | None = None
-        self._bias_calibration: list[np.ndarray] = []
+        # (6,) biases of gyroscope, rad/s, and accelerometer, m/s^2, body: reference, and change
+        self._bias, self._bias_moved = np.zeros((2, 6))
 
     def forget(self, gone: np.ndarray) -> None:
         """Remove anchors that are gone from all results and stored data.
@@ -274,8 +273,7 @@ class Monitor:
             self._keep_one_slice()
 
     def _judge(self, end: float, residuals: Residuals, odometry: Odometry) -> None:
-        # Test the slice that ends at `end`, in s, for exchanges, changes and deviations, and update
-        # the IMU biases.
+        # Test the slice that ends at `end`, in s, for exchanges, changes and deviations.
         a, b = self._anchors.index(residuals.a), self._anchors.index(residuals.b)
         place = odometry.p.mean(axis=0) if len(odometry) else None
         self._listen(a, b, place)
@@ -292,7 +290,9 @@ class Monitor:
             self._moving_since = end
         if math.isnan(self._moving_since) or place is None or not len(a):
             return
-        self._follow_biases(end, np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]]))
+        bias = np.concatenate([odometry.gyro_bias[-1], odometry.accel_bias[-1]])
+        self._bias = bias if end < self._moving_since + CALIBRATE else self._bias
+        self._bias_moved = bias - self._bias
         swap = self._look_for_swap(a, b, innovation, place, speed > MOVING) or self._swapped
         if not swap and accepted >= FEWEST_ACCEPTED:
             piece = reduced(end - 0.5 * LENGTH, place, positions, a, b, innovation)
@@ -477,22 +477,13 @@ class Monitor:
             zip(rows, np.linalg.norm(self._anchors.positions[rows] - place, axis=1).tolist())
         )
 
-    def _follow_biases(self, end: float, bias: np.ndarray) -> None:
-        # Average the biases in the second half of CALIBRATE as reference, and keep the latest.
-        if end < self._moving_since + CALIBRATE:
-            self._bias_calibration.append(bias)
-        elif self._bias_reference is None and self._bias_calibration:
-            self._bias_reference = np.mean(
-                self._bias_calibration[len(self._bias_calibration) // 2 :], axis=0
-            )
-        self._bias_now = bias
-
     @property
     def alarms(self) -> list[str]:
         """Return sentences on changes and on deviations from the survey."""
-        return [
-            *(finding.brief for finding in self._anchor_findings().values()),
-            *self._axis_alarms(),
+        return [finding.brief for finding in self._anchor_findings().values()] + [
+            f"{axis}: bias moved by {moved:+.3f} {unit} since the first {CALIBRATE:g} s in motion"
+            for axis, moved, (limit, unit) in zip(AXES, self._bias_moved.tolist(), BIAS_LIMITS)
+            if abs(moved) > limit
         ]
 
     @property
@@ -594,20 +585,6 @@ class Monitor:
             remedy=f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}",
             value=off,
         )
-
-    def _axis_alarms(self) -> list[str]:
-        """Return sentences on IMU axes whose bias differs from the reference."""
-        if self._bias_reference is None or self._bias_now is None:
-            return []
-        moved, out = self._bias_now - self._bias_reference, []
-        for k, (name, (limit, unit)) in enumerate(BIAS_LIMITS.items()):
-            for axis, value in zip("xyz", moved[3 * k : 3 * k + 3].tolist()):
-                if abs(value) > limit:
-                    out.append(
-                        f"{name} {axis}: bias moved by {value:+.3f} {unit} since the first "
-                        f"{CALIBRATE:g} s in motion"
-                    )
-        return out
 
 
 def _split(part: Part, end: float) -> tuple[Part, Part]:

@@ -245,9 +245,7 @@ def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) ->
     """Return the OrderedRecording without the mistakes that the streams show directly."""
     for finding in found:
         if finding.rule == "survey_scale" and tdoa_rules.in_metres(ordered):
-            ordered = replace(
-                ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value)
-            )
+            ordered = ordered.scaled(finding.value)
         elif finding.rule == "tdoa_wraps":
             ordered = ordered.possible()
         imu = ordered.imu

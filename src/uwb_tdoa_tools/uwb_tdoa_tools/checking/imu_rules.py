@@ -19,18 +19,12 @@ import numpy as np
 from uwb_tdoa_bias.common.flight import Flight, Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.imu_fault_detector import FASTEST
-from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, structured
-from uwb_tdoa_ekf.monitoring.explain import (
-    Unexplained,
-    compare,
-    in_words,
-    unexplained,
-)
+from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words
 from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.inertial_rules import AXES, TURN_EXCESS, turn_excess
 from uwb_tdoa_ekf.monitoring.windows import Cutter, imu_window
 
-from .ordered import OrderedRecording, is_flat
+from .ordered import OrderedRecording, Trial, is_flat
 
 # Clipped: at least HITS samples have the extreme value, more than MORE times the mean count of the
 # NEXT values beside it. In healthy recordings it is about 1 time.
@@ -136,6 +130,7 @@ ARRANGEMENTS = [
     np.diag(signs)[list(order)]
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))
 ]
+RATE_UNIT = "imu_rate_unit"
 # Factors of the gyroscope, and its unit then. (Degrees/s are seen in the stream itself.)
 SCALES = {
     180.0 / np.pi: "rad/s, divided by 57.3 once too often",
@@ -161,14 +156,16 @@ class Arrangement(NamedTuple):
     ----------
     ratio, z : float
         Ratio of the losses, and its number of standard errors.
-    accel, gyro : (3, 3) array
-        Matrices that are applied to the specific force and to the rates.
+    mistakes : float
+        How many mistakes the arrangement consists of.
+    trial : Trial
+        The recording in this arrangement.
     """
 
     ratio: float
     z: float
-    accel: np.ndarray
-    gyro: np.ndarray
+    mistakes: float
+    trial: Trial
 
 
 def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
@@ -189,11 +186,11 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
         or is_flat(recording.anchors.positions)
     ):
         return None
-    worse = compare(brief.unexplained(), unexplained(*_measured(brief), FilterConfig()))[0]
+    worse = compare(brief.unexplained(), brief.unexplained(config=FilterConfig()))[0]
     if not worse > FITS:
         return None
-    base = _unexplained(brief)
-    left_out = compare(base, unexplained(*_measured(brief), replace(LEANING, use_imu=False)))
+    base = brief.unexplained(config=LEANING)
+    left_out = compare(base, brief.unexplained(config=replace(LEANING, use_imu=False)))
     found = _wrong_arrangement(brief, base, min(RATIO, AS_WITHOUT * left_out[0]))
     if found is None and worse > ANOTHER and left_out[0] < NEEDLESS and left_out[1] > DEVIATIONS:
         found = Finding(
@@ -218,21 +215,22 @@ def _wrong_arrangement(brief: OrderedRecording, base: Unexplained, most: float) 
     assert brief.imu is not None
     usual = [(accel, gyro) for accel, gyro in USUAL if _is_possible(brief.imu, gyro)]
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in usual]
-    best = min(trials, key=_ratio)
-    turned = _turned_survey(base, brief, min(best.ratio + NEARLY, most))
-    if turned is not None or not best.ratio < RATIO:
+    least = min(one.ratio for one in trials)
+    turned = _turned_survey(base, brief, min(least + NEARLY, most))
+    if turned is not None or not least < RATIO:
         return turned
-    if abs(scale_of(best.gyro) - 1.0) < 0.03:  # the unit of the rates is right: an axis is wrong
-        trials += _all(brief, base)
-    least = min(trials, key=_ratio).ratio
-    equal = [trial for trial in trials if trial.ratio < least + TIE and trial.z > DEVIATIONS]
+    if min(trials, key=lambda one: one.ratio).trial.finding.rule != RATE_UNIT:
+        trials += _all(brief, base)  # the unit of the rates is right: an axis is wrong
+    least = min(one.ratio for one in trials)
+    equal = [one for one in trials if one.ratio < least + TIE and one.z > DEVIATIONS]
     if not equal or least > most:
         return None
-    simplest = min(equal, key=lambda trial: _complexity(trial.accel, trial.gyro))
-    evidence = in_words(simplest.ratio, simplest.z)
+    simplest = min(equal, key=lambda one: one.mistakes)
+    found = simplest.trial.explained(simplest.ratio, simplest.z)
     if len(equal) > 1:
-        evidence += f"; {len(equal) - 1} other arrangements fit about as well"
-    return _finding(simplest, evidence)
+        more = f"; {len(equal) - 1} other arrangements fit about as well"
+        found = replace(found, evidence=found.evidence + more)
+    return found
 
 
 def _is_possible(imu: Imu, gyro: np.ndarray) -> bool:
@@ -261,7 +259,7 @@ def _turned_survey(base: Unexplained, recording: OrderedRecording, most: float) 
     better = []
     for axes, positions, matrix in SURVEYS:
         turned = replace(recording, anchors=recording.anchors.at(places @ matrix))
-        ratio, z = compare(base, _unexplained(turned, RATIO * base.mean))
+        ratio, z = compare(base, turned.unexplained(RATIO * base.mean, LEANING))
         if ratio < most and z > DEVIATIONS:
             better.append((ratio, z, axes, positions))
     if not better:
@@ -315,12 +313,11 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
 
     The accelerometer is fixed, because the yaw is unknown anyway.
     """
-    short = recording.part(BRIEF)
+    short, losses = recording.part(BRIEF), list[float]()
     arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
-    losses: list[float] = []
     for accel, gyro in arrangements:
         least = sorted(losses)[CHOSEN - 1] if len(losses) >= CHOSEN else np.inf
-        loss = _unexplained(_arranged(short, accel, gyro), least).mean
+        loss = _arranged(short, accel, gyro).recording.unexplained(least, LEANING).mean
         losses.append(loss if np.isfinite(loss) else np.inf)
     chosen = [arrangements[k] for k in np.argsort(losses, kind="stable")[:CHOSEN]]
     return [_tried(base, recording, accel, gyro) for accel, gyro in chosen]
@@ -333,37 +330,18 @@ def _tried(
 
     The ratio is infinite if the loss is too large for the arrangement to be taken, or to tie.
     """
-    arranged = _arranged(recording, accel, gyro)
-    ratio, z = compare(base, _unexplained(arranged, (RATIO + TIE) * base.mean))
-    return Arrangement(ratio if np.isfinite(ratio) else np.inf, z, accel, gyro)
+    trial = _arranged(recording, accel, gyro)
+    ratio, z = compare(base, trial.recording.unexplained((RATIO + TIE) * base.mean, LEANING))
+    ratio = ratio if np.isfinite(ratio) else np.inf
+    return Arrangement(ratio, z, _complexity(accel, gyro), trial)
 
 
-def _ratio(trial: Arrangement) -> float:
-    return trial.ratio
-
-
-def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
-    """Return the recording with samples rotated by (3, 3) matrices."""
+def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> Trial:
+    """Return the Trial with samples rotated by (3, 3) matrices."""
     assert recording.imu is not None
     forces, rates = recording.imu.accel @ accel.T, recording.imu.gyro @ gyro.T
-    return recording.with_imu(accel=np.ascontiguousarray(forces), gyro=np.ascontiguousarray(rates))
-
-
-def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplained:
-    """Return the Unexplained of the TDOAs by a filter that relies on the IMU.
-
-    limit : see `monitoring.explain.unexplained`.
-    """
-    return unexplained(*_measured(recording), LEANING, limit)
-
-
-def _measured(recording: OrderedRecording) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return TDOAs, positions of the anchors, and inertial samples, as `unexplained` takes them."""
-    tdoa, imu, (a, b) = recording.tdoa, recording.imu, recording.rows()
-    assert imu is not None
-    rows = structured(TDOA, tdoa.t, a, b, tdoa.d, tdoa.variance)[np.lexsort((tdoa.d, b, a, tdoa.t))]
-    samples, usable = imu_rows(imu.t, imu.gyro, imu.accel)
-    return rows, recording.anchors.positions, samples[usable]
+    other = recording.with_imu(accel=np.ascontiguousarray(forces), gyro=np.ascontiguousarray(rates))
+    return Trial(other, _finding(accel, gyro))
 
 
 def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
@@ -377,21 +355,21 @@ def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
     return wrong_signs + moved + 1.0 * np.array_equal(accel, MIRROR)
 
 
-def _finding(found: Arrangement, evidence: str) -> Finding:
-    ratio, _, accel, gyro = found
+def _finding(accel: np.ndarray, gyro: np.ndarray) -> Finding:
+    """Return what to report, without evidence, if (3, 3) matrices undo the mistake."""
     scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
         return Finding(
-            "imu_rate_unit",
+            RATE_UNIT,
             ERROR,
             cause=f"the gyroscope is in {unit}",
-            evidence=evidence,
+            evidence="",
             remedy=(
                 f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
                 "message.angular_velocity"
             ),
-            value=scale,
+            value=np.nan,
         )
     if np.array_equal(accel, MIRROR) and np.array_equal(gyro, -MIRROR):
         return Finding(
@@ -402,12 +380,12 @@ def _finding(found: Arrangement, evidence: str) -> Finding:
                 "down, "
                 "or two are exchanged"
             ),
-            evidence=evidence,
+            evidence="",
             remedy=(
                 "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = "
                 "-z"
             ),
-            value=ratio,
+            value=np.nan,
         )
     parts = []
     for name, variable, matrix in (("accelerometer", "a", accel), ("gyroscope", "w", gyro)):
@@ -424,9 +402,9 @@ def _finding(found: Arrangement, evidence: str) -> Finding:
         cause=(
             f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
         ),
-        evidence=evidence,
+        evidence="",
         remedy=line,
-        value=ratio,
+        value=np.nan,
     )
 
 

@@ -9,17 +9,16 @@ removal of constant biases and slow changes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.flight import Flight, Imu, Truth
 from uwb_tdoa_bias.common.geometry import tdoa as predicted_tdoa
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
+from .recording import Recording
 from .time_rules import BLOCK, LONGEST, Delays, delays, drift_or_jump
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell is averaged
@@ -179,20 +178,7 @@ def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray
     return second / HALF**2 + values.mean(axis=0)
 
 
-class WithTruth(Protocol):
-    """A Flight or a Recording."""
-
-    @property
-    def anchors(self) -> Anchors: ...
-    @property
-    def tdoa(self) -> Tdoas: ...
-    @property
-    def imu(self) -> Imu | None: ...
-    @property
-    def truth(self) -> Truth | None: ...
-
-
-def truth_unit(recording: WithTruth) -> Iterator[Finding]:
+def truth_unit(recording: Flight | Recording) -> Iterator[Finding]:
     """Yield a finding if the TDOAs fit to the ground truth in another unit of length only."""
     truth, tdoa, anchors = recording.truth, recording.tdoa, recording.anchors
     if truth is None or len(truth) < 2:
@@ -223,7 +209,7 @@ def truth_unit(recording: WithTruth) -> Iterator[Finding]:
         )
 
 
-def judge_imu(recording: WithTruth, stamps: bool = True) -> list[Finding]:
+def judge_imu(recording: Flight | Recording, stamps: bool = True) -> list[Finding]:
     """Return findings on an IMU against the recorded attitude; none without one.
 
     stamps : whether to judge its filter and its stamps, too

@@ -21,10 +21,18 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
-from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.core.memory import TDOA, imu_rows, new_state, structured
 from uwb_tdoa_ekf.core.ranges import APART
 from uwb_tdoa_ekf.core.startup import locate, room_for
-from uwb_tdoa_ekf.monitoring.explain import SCALE, Unexplained, unexplained
+from uwb_tdoa_ekf.monitoring.explain import (
+    CONFIG as WITHOUT_IMU,
+    NO_IMU,
+    SCALE,
+    Unexplained,
+    in_words,
+    unexplained,
+)
+from uwb_tdoa_ekf.monitoring.finding import Finding
 from uwb_tdoa_ekf.monitoring.windows import BEYOND
 from uwb_tdoa_ekf.results import rows_of
 
@@ -405,14 +413,24 @@ class OrderedRecording:
         """Return the rows of the anchors of each TDOA, two (n,) arrays, -1 for unknown ids."""
         return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
 
-    def unexplained(self, limit: float = math.inf) -> Unexplained:
-        """Return the Unexplained of the TDOAs alone.
+    def scaled(self, factor: float) -> OrderedRecording:
+        """Return the same with a survey that is smaller by a factor."""
+        return replace(self, anchors=self.anchors.at(self.anchors.positions / factor))
+
+    def unexplained(
+        self, limit: float = math.inf, config: FilterConfig = WITHOUT_IMU
+    ) -> Unexplained:
+        """Return the Unexplained of the TDOAs by a filter, which takes the IMU if `config` does.
 
         limit : if the mean loss is certain to exceed this, the result holds no blocks, see
             `monitoring.explain.unexplained`.
         """
-        rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d)
-        return unexplained(rows, self.anchors.positions, limit=limit)
+        tdoa, samples = self.tdoa, NO_IMU
+        rows = structured(TDOA, tdoa.t, *self.rows(), tdoa.d, tdoa.variance)
+        if self.imu is not None and config.use_imu:
+            samples, usable = imu_rows(self.imu.t, self.imu.gyro, self.imu.accel)
+            samples = samples[usable]
+        return unexplained(rows, self.anchors.positions, samples, config, limit)
 
     @cached_property
     def survey_fit(self) -> SurveyFit:
@@ -426,6 +444,29 @@ class OrderedRecording:
     def flight(self) -> Flight:
         """Return a Flight without ground truth."""
         return Flight("checked", self.anchors, self.tdoa, self.imu)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A recording with one mistake undone.
+
+    Attributes
+    ----------
+    recording : OrderedRecording
+        The corrected recording.
+    finding : Finding
+        What to report, without evidence, if the correction explains much more.
+    share : float
+        Share of the TDOAs that it changes.
+    """
+
+    recording: OrderedRecording
+    finding: Finding
+    share: float = 1.0
+
+    def explained(self, ratio: float, z: float) -> Finding:
+        """Return the Finding for the ratio of the losses and its number of standard errors."""
+        return replace(self.finding, evidence=in_words(ratio, z), value=ratio)
 
 
 def _busiest(recording: OrderedRecording, length: float) -> float:

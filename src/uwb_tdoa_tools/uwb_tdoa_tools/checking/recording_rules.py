@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Judge a recording by what its messages state: frames, topics, anchors, clocks, publishers, ranges.
+"""Judge a recording by what its messages state: frames, topics, anchors, clocks, publishers.
 
 A rule takes a Recording and yields Findings.
 """
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.sensors import SENSORS, Ranges
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
 from ..bags.messages import BODY_FRAME
@@ -23,8 +23,6 @@ from .tdoa_rules import largest_displacement, same_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..live.session import End
 
@@ -404,105 +402,6 @@ def volatile_anchors(recording: Recording) -> Iterator[Finding]:
                 )
 
 
-WINDOW = 0.25  # s in which the tag hardly moves
-FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
-LARGE, LARGEST = 0.1, 5.0  # m, limits of a finding
-DELAYS = 0.6  # m; larger than the delays of usual antennas
-AGREE = 0.8  # share of the windows with the same sign
-SCALE = 0.2  # m, beyond which a range counts less
-DILUTION = 5.0  # largest ratio of standard deviations: common error over a single range
-STEPS, DAMPING = 20, 1e-3
-REMEDY = (
-    "calibrate it: survey, or diagnose where there is ground truth; until then leave "
-    "range_offset_std above 0.0: the filter finds it after each start"
-)
-
-
-def tag_delay(recording: Recording) -> Iterator[Finding]:
-    """Yield a finding if all ranges are wrong by about the same: the antenna delay of the tag.
-
-    TDOAs do not depend on it. Without `range_offset_std` the position error exceeds the delay where
-    the anchors are on one side.
-    """
-    ranges = recording.sensors.get("range")
-    if not isinstance(ranges, Ranges):
-        return
-    offsets = window_offsets(ranges, recording.anchors)
-    if len(offsets) < FEWEST_WINDOWS:
-        return
-    offset = float(np.median(offsets))
-    if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
-        low, high = np.quantile(offsets, [0.25, 0.75])
-        severity, cause = NOTE, "the antenna delay of the tag"
-        if abs(offset) > DELAYS:
-            size = float(np.nanmedian(ranges.d))
-            severity, cause = (
-                WARNING,
-                f"{cause}, or all are {size / (size - offset):.2f} times the distances",
-            )
-        yield Finding(
-            "tag_delay",
-            severity,
-            cause=(
-                f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: "
-                f"{cause}"
-            ),
-            evidence=(
-                f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, "
-                f"{low:.2f} "
-                f"to {high:.2f} m in half of them"
-            ),
-            remedy=REMEDY,
-            value=offset,
-        )
-
-
-def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
-    """Return the common error of the ranges in each window.
-
-    Parameters
-    ----------
-    ranges : Ranges
-        Distances to anchors.
-    anchors : Anchors
-        The survey.
-
-    Returns
-    -------
-    (k,) array
-        Errors that the distances from one position do not explain, m, where they are determined.
-    """
-    row = anchors.index(ranges.anchor)
-    usable = (row >= 0) & np.isfinite(ranges.d) & np.isfinite(ranges.t)
-    row, d, t = row[usable], ranges.d[usable], ranges.t[usable]
-    if not len(t):
-        return np.empty(0)
-    _, first = np.unique(np.floor((t - t.min()) / WINDOW), return_index=True)
-    parts = list(zip(np.split(row, first[1:]), np.split(d, first[1:])))
-    parts = [(rows, some) for rows, some in parts if len(np.unique(rows)) >= FEWEST_ANCHORS]
-    chosen = np.unique(np.linspace(0, len(parts) - 1, min(len(parts), MOST_WINDOWS)).astype(int))
-    found = (_offset(anchors.positions[parts[k][0]], parts[k][1]) for k in chosen)
-    return np.array([one for one in found if one is not None])
-
-
-def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
-    """Return the common error of ranges d (n,) m to anchors (n, 3) m; None if it is not determined.
-
-    Gauss-Newton with Huber's weights.
-    """
-    x = np.append(positions.mean(axis=0), 0.0)
-    for _ in range(STEPS):
-        away = x[:3] - positions
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
-        error = d - distance - x[3]
-        weight = np.minimum(1.0, SCALE / np.maximum(np.abs(error), 1e-9))
-        jacobian = np.column_stack([away / distance[:, None], np.ones(len(d))])
-        gram = jacobian.T @ (weight[:, None] * jacobian) + DAMPING * np.eye(4)
-        x = x + np.linalg.solve(gram, jacobian.T @ (weight * error))
-    determined = float(np.sqrt(np.linalg.inv(gram)[3, 3])) < DILUTION and bool(np.isfinite(x).all())
-    return float(x[3]) if determined else None
-
-
 RULES = (
     sensor_mistakes,
     frames,
@@ -518,5 +417,4 @@ RULES = (
     incompatible_qos,
     several_publishers,
     volatile_anchors,
-    tag_delay,
 )

@@ -1,6 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Find sensors that contradict everything else, or that draw the filter away from the TDOAs."""
+"""Find sensors that contradict everything else, that draw the filter away from the TDOAs, or that are
+off by a constant.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.sensors.sensor import Sensor
 from uwb_tdoa_ekf.core.memory import INVALID, REJECTED, REPEATED, STARTUP
 from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, in_words
-from uwb_tdoa_ekf.monitoring.finding import WARNING, Finding
+from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding
 from uwb_tdoa_ekf.offline import Run
 
 from ..estimate import FlightEstimator
@@ -27,6 +29,9 @@ LASTS, SHARE = 5, 0.2
 # 0.93 (TDOAs have errors of the height), optical flow 1.00; wheels that stand still 0.28 to 0.78.
 RATIO, DEVIATIONS = 0.85, 2.5
 FEWEST = 20  # ranges of an anchor
+# m, common error of all ranges that is reported; more than the delays of usual antennas; and its
+# least number of standard deviations
+LARGE, DELAYS, SURE = 0.1, 0.6, 5.0
 
 
 def judge_sensors(flight: Flight, run: Run, estimator: FlightEstimator) -> list[Finding]:
@@ -35,7 +40,7 @@ def judge_sensors(flight: Flight, run: Run, estimator: FlightEstimator) -> list[
     A sensor misleads if the TDOAs fit better without it. Only the one without which they fit best is
     named, and none beside a sensor that contradicts everything.
     """
-    found: list[Finding] = []
+    delay, found = [*tag_delay(flight, run)], list[Finding]()
     for name, rows in run.sensors.items():
         stream = getattr(flight, name)
         refused = (rows["verdict"] == INVALID) & np.isfinite(stream.values).all(axis=1)
@@ -44,7 +49,34 @@ def judge_sensors(flight: Flight, run: Run, estimator: FlightEstimator) -> list[
             found += _contradicting_anchors(stream.anchor, unused, SENSORS[name].plural)
         elif len(stream):
             found += _contradicting(stream.t, unused, SENSORS[name])
-    return found or _misleading(flight, run, estimator)
+    return delay + (found or _misleading(flight, run, estimator))
+
+
+def tag_delay(flight: Flight, run: Run) -> Iterator[Finding]:
+    """Yield a finding if the filter finds a common error of all ranges: the antenna delay of the tag.
+
+    TDOAs do not depend on it. Without `range_offset_std` the position error exceeds the delay where
+    the anchors are on one side.
+    """
+    offset, std = run.range_offset or (0.0, np.inf)
+    if abs(offset) < max(LARGE, SURE * std):
+        return
+    severity, cause = NOTE, "the antenna delay of the tag"
+    if abs(offset) > DELAYS and flight.range is not None:
+        size = float(np.nanmedian(flight.range.d))
+        scale = size / (size - offset)
+        severity, cause = WARNING, f"{cause}, or all are {scale:.2f} times the distances"
+    yield Finding(
+        "tag_delay",
+        severity,
+        cause=f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: {cause}",
+        evidence=f"{offset:.2f} m, standard deviation {std:.2f} m",
+        remedy=(
+            "calibrate it: survey, or diagnose where there is ground truth; until then leave "
+            "range_offset_std above 0.0: the filter finds it after each start"
+        ),
+        value=offset,
+    )
 
 
 def _contradicting(t: np.ndarray, unused: np.ndarray, sensor: Sensor) -> Iterator[Finding]:

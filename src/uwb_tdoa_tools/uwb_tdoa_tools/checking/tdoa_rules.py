@@ -9,7 +9,7 @@ report if that explains much more.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,13 +18,21 @@ from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, in_words, innovations
+from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, innovations
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
-from uwb_tdoa_ekf.monitoring.judge import Judge, exchanged, wrong_sign, wrong_unit
+from uwb_tdoa_ekf.monitoring.judge import Judge, exchanged, wrong_scale, wrong_sign
 from uwb_tdoa_ekf.monitoring.windows import Cutter, tdoa_window
 from uwb_tdoa_ekf.offline import run_offline
 
-from .ordered import LEAST_MOTION, LONG, SHORT, OrderedRecording, SurveyFit, second_principal_std
+from .ordered import (
+    LEAST_MOTION,
+    LONG,
+    SHORT,
+    OrderedRecording,
+    SurveyFit,
+    Trial,
+    second_principal_std,
+)
 from .pair_rules import MANY, OFF
 
 Survey = tuple[str, Anchors]  # its name, and what it says
@@ -63,40 +71,6 @@ APART = 1.0  # m, least error of such an anchor: anchors of a hall are farther f
 CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs longer than FAR, m, that fit the other sign
 MOST_PAIRS = 4  # pairs that may have a wrong sign each
 SAME = 0.2  # m at most between the places of an anchor in two surveys of one installation
-
-
-@dataclass(frozen=True)
-class MistakeTrial:
-    """A recording with one mistake undone.
-
-    Attributes
-    ----------
-    rule : str
-        Name of the rule.
-    recording : OrderedRecording
-        The corrected recording.
-    cause, remedy : str
-        As of the Finding if the correction explains much more.
-    share : float
-        Share of the TDOAs that it changes.
-    """
-
-    rule: str
-    recording: OrderedRecording
-    cause: str
-    remedy: str
-    share: float = 1.0
-
-    def finding(self, ratio: float, z: float) -> Finding:
-        """Return the Finding for the ratio of the losses and its number of standard errors."""
-        return Finding(
-            self.rule,
-            ERROR,
-            cause=self.cause,
-            evidence=in_words(ratio, z),
-            remedy=self.remedy,
-            value=ratio,
-        )
 
 
 def in_metres(recording: OrderedRecording) -> bool:
@@ -145,20 +119,18 @@ def successive_difference(tdoa: Tdoas) -> float:
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def judged(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def judged(recording: OrderedRecording) -> Iterator[Trial]:
     """Yield the trials with the other sign, and with the two ids exchanged that the Judge prefers.
 
     Ids are not tried for motion along a line: in a room that is symmetrical about it, anchors differ
     by their systematic errors alone.
     """
-    sign, other = wrong_sign("", 0.0), recording.with_tdoa(d=-recording.tdoa.d)
-    yield MistakeTrial(sign.rule, other, sign.cause, sign.remedy)
+    yield Trial(recording.with_tdoa(d=-recording.tdoa.d), wrong_sign(""))
     rows = judge_of(recording).exchange
     if rows and second_principal_std(recording.survey_fit.places) >= LEAST_MOTION:
         one, two = recording.anchors.ids[list(rows)].tolist()
         table = {one: two, two: one}
-        finding, other = exchanged(table, ""), relabelled(recording, table)
-        yield MistakeTrial(finding.rule, other, finding.cause, finding.remedy)
+        yield Trial(relabelled(recording, table), exchanged(table, ""))
 
 
 def judge_of(recording: OrderedRecording) -> Judge:
@@ -177,20 +149,16 @@ def judge_of(recording: OrderedRecording) -> Judge:
     return judge
 
 
-def scaled_survey(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def scaled_survey(recording: OrderedRecording) -> Iterator[Trial]:
     """Yield trials with the survey in another unit.
 
     (If the TDOAs show it directly, the rules of streams have reported it before.)
     """
     for name, factor in SURVEY_UNITS.items():
-        anchors = recording.anchors.at(recording.anchors.positions / factor)
-        cause, remedy = wrong_unit(name, factor)
-        yield MistakeTrial(
-            "survey_scale", replace(recording, anchors=anchors), cause=cause, remedy=remedy
-        )
+        yield Trial(recording.scaled(factor), wrong_scale(name, factor, ""))
 
 
-def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
+def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Trial]:
     """Yield trials with other surveys, [(name, Anchors)].
 
     Surveys of one installation on different days count as one.
@@ -202,11 +170,16 @@ def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Itera
         if same_place(anchors, recording.anchors):
             continue
         names = " or ".join([name, *duplicates])
-        yield MistakeTrial(
-            "survey_other",
+        yield Trial(
             replace(recording, anchors=anchors),
-            cause=f"the survey is of another room or day: {names} fits",
-            remedy=f"--survey {name}",
+            Finding(
+                "survey_other",
+                ERROR,
+                cause=f"the survey is of another room or day: {names} fits",
+                evidence="",
+                remedy=f"--survey {name}",
+                value=np.nan,
+            ),
         )
 
 
@@ -227,7 +200,7 @@ def largest_displacement(one: Anchors, other: Anchors) -> float:
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def renumbered_ids(recording: OrderedRecording) -> Iterator[Trial]:
     """Yield the trial with renumbered ids: the same anchors in the same order, with other numbers."""
     heard = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b])
     known = np.sort(recording.anchors.ids)
@@ -235,14 +208,19 @@ def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         return
     table = dict(zip(heard.tolist(), known.tolist()))
     shift = heard[0] - known[0]
-    yield MistakeTrial(
-        "ids_renumbered",
+    yield Trial(
         relabelled(recording, table),
-        cause=(
-            f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} is "
-            f"{known[0]} ... {known[-1]} there"
+        Finding(
+            "ids_renumbered",
+            ERROR,
+            cause=(
+                f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
+                f"is {known[0]} ... {known[-1]} there"
+            ),
+            evidence="",
+            remedy=f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]",
+            value=np.nan,
         ),
-        remedy=f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]",
     )
 
 
@@ -259,20 +237,24 @@ def _far_off(recording: OrderedRecording) -> np.ndarray:
     return recording.anchors.ids[rows[each > limit]]
 
 
-def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def inverted_pairs(recording: OrderedRecording) -> Iterator[Trial]:
     """Yield trials with the sign of single pairs inverted, or of all pairs with the larger id first."""
     tdoa = recording.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
     if 0.2 < backward.mean() < 0.8:
-        yield MistakeTrial(
-            "tdoa_one_sign",
+        yield Trial(
             _flipped(recording, backward),
-            cause="the sign of the TDOAs does not follow the order of the anchors",
-            remedy=(
-                "message.distance_difference = distance_to_b - distance_to_a  # in the order of "
-                "the "
-                "message's ids"
+            Finding(
+                "tdoa_one_sign",
+                ERROR,
+                cause="the sign of the TDOAs does not follow the order of the anchors",
+                evidence="",
+                remedy=(
+                    "message.distance_difference = distance_to_b - distance_to_a  # in the order "
+                    "of the message's ids"
+                ),
+                value=np.nan,
             ),
         )
     wrong = _contrary(recording.part(LONG), pairs)
@@ -281,18 +263,15 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     flip = np.zeros(len(tdoa), dtype=bool)
     for a, b in wrong:
         flip |= (tdoa.a == a) & (tdoa.b == b)
-    trial = _flipped(recording, flip)
-    if still_gains(trial.survey_fit):
+    other = _flipped(recording, flip)
+    if still_gains(other.survey_fit):
         # With a survey of another room some pairs seem to have the other sign, and it does not fit.
         return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
-    yield MistakeTrial(
-        "pair_sign",
-        trial,
-        cause=f"the sign of the pairs {names} is wrong",
-        remedy=f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why",
-        share=flip.mean(),
-    )
+    remedy = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
+    cause = f"the sign of the pairs {names} is wrong"
+    found = Finding("pair_sign", ERROR, cause, "", remedy, np.nan)
+    yield Trial(other, found, share=flip.mean())
 
 
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
@@ -314,7 +293,7 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
     return recording.with_tdoa(d=np.where(rows, -recording.tdoa.d, recording.tdoa.d))
 
 
-def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def moved_anchor(recording: OrderedRecording) -> Iterator[Trial]:
     """Yield the trial with one anchor moved to where the TDOAs are explained.
 
     There is none if the survey may be right, or if all anchors moved explain much more than one.
@@ -331,13 +310,18 @@ def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         return
     number = int(recording.anchors.ids[row])
     shift = ", ".join(f"{s:+.1f}" for s in positions[row] - fit.positions[row])
-    yield MistakeTrial(
-        "anchor_moved",
+    yield Trial(
         replace(recording, anchors=recording.anchors.at(positions)),
-        cause=f"anchor {number} is not where the survey has it, but about ({shift}) m from there",
-        remedy=(
-            f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and "
-            "axes"
+        Finding(
+            "anchor_moved",
+            ERROR,
+            cause=f"anchor {number} is not where the survey has it, but about ({shift}) m from there",
+            evidence="",
+            remedy=(
+                f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits "
+                "and axes"
+            ),
+            value=np.nan,
         ),
     )
 
@@ -401,7 +385,7 @@ def best_trial(
                 trials.append((ratio, z, trial))
     if trials:
         ratio, z, trial = min(trials, key=lambda entry: entry[0])
-        return trial.finding(ratio, z), trial.recording
+        return trial.explained(ratio, z), trial.recording
     return other_unit(recording) or (None, recording)
 
 
