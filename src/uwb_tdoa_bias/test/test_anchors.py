@@ -344,6 +344,13 @@ def sentence(positions):
     return survey_fault(Anchors.from_positions(positions, ids=np.arange(len(positions)) + 10))
 
 
+def test_a_line_of_anchors_along_a_parallel_is_in_degrees():
+    along = np.arange(6)
+    degrees = np.column_stack([np.full(6, 48.1), 11.5 + 2e-5 * along, 0.5 + along % 2])
+    assert "latitude and longitude" in sentence(degrees)
+    assert not sentence(np.column_stack([np.full(6, 48.1), 11.5 + 2.0 * along, 0.5 + along % 2]))
+
+
 def changed(rows, function):
     """Return the positions of ROOM, with a function applied to some rows."""
     positions = ROOM.copy()

@@ -269,3 +269,16 @@ def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):
         np.testing.assert_array_equal(one, other)
     made = read_recording(Reading(), tmp_path / "ranged.bag")
     assert len(made.sensors["range"]) == len(ranged.range) and not check(made).faulty
+
+
+@pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
+def test_two_tags_with_few_tdoas_each_are_named(protocol):
+    """Each pair is heard after a second, not twice within 0.1 s."""
+    given = {"protocol": protocol, "tdoa_rate": 14.0, "duration": 40.0, "imu_rate": 50.0}
+    one = checking_flights.recording(1, trajectory="sines", **given)
+    other = checking_flights.recording(2, trajectory="circle", **given)
+    both = MISTAKES["second_tag"].make(one, None, other)
+    assert "two_tags" in {one.rule for one in processed_streams(both).findings()}
+    alone = checking_flights.recording(3, **{**given, "tdoa_rate": 28.0, "speed": 1.8})
+    for sound in (one, alone):
+        assert "two_tags" not in {one.rule for one in processed_streams(sound).findings()}

@@ -283,6 +283,19 @@ def test_an_imu_of_another_tag_is_not_in_another_unit(healthy):
     assert found.rule == "imu_other_body" and found.severity == "error"
 
 
+@pytest.mark.slow
+def test_a_measured_imu_of_another_time_is_named(shared):
+    """The TDOAs fit only a sixth better without it."""
+    survey = shared / "data/surveys/anchor_0422.txt"
+    flight = read_flight(shared / "data/flights/0422/0422-log00", survey)
+    made = OrderedRecording.of(of_flight(flight))
+    later = int(0.4 * len(made.imu))
+    rates, forces = (np.roll(column, later, 0) for column in (made.imu.gyro, made.imu.accel))
+    assert imu_rules.find_imu_mistake(made) is None
+    found = imu_rules.find_imu_mistake(made.with_imu(gyro=rates, accel=forces))
+    assert found.rule == "imu_other_body" and "17 %" in found.evidence
+
+
 def test_a_gyroscope_that_turns_as_gravity_does_not_is_no_explanation(healthy):
     scale = max(imu_rules.SCALES)
     assert not imu_rules._is_possible(healthy.imu, scale * np.eye(3))

@@ -161,11 +161,11 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
 def test_two_exchanged_anchors_of_a_hall_are_named(sound):
     whole = OrderedRecording.of(of_flight(sound))
     brief = whole.part(SHORT)
-    assert [trial.rule for trial in tdoa_rules.judged(whole)] == ["tdoa_sign"]
+    assert [trial.finding.rule for trial in tdoa_rules.judged(whole)] == ["tdoa_sign"]
     ids, times = np.unique(np.concatenate([brief.tdoa.a, brief.tdoa.b]), return_counts=True)
     one, two = sorted(ids[np.argsort(-times)][[0, 5]].tolist())
     _, trial = tdoa_rules.judged(tdoa_rules.relabelled(whole, {one: two, two: one}))
-    assert trial.cause == f"two anchors are exchanged, {one} and {two}"
+    assert trial.finding.cause == f"two anchors are exchanged, {one} and {two}"
 
 
 def test_a_fast_tag_does_not_speak_against_the_survey():

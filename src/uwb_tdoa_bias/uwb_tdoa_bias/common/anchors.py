@@ -212,7 +212,7 @@ def survey_fault(anchors: Anchors) -> str:
     level = anchors.positions[:, :2]
     spread = np.ptp(level, axis=0)
     if (
-        (spread > 0.0).all()
+        (spread > 0.0).any()
         and (MANY_TIMES * spread < np.abs(level)).all()
         and spread.max() < SMALL
     ):

@@ -23,7 +23,12 @@ DUPLICATES = 0.02  # share of TDOAs that come twice; healthy 0
 # share of TDOAs that repeat the value of their pair, healthy 0.03; the same in one window, healthy
 # 0.09, from which on the values stand still
 REPEATS, FROZEN = (0.15, 0.95)
-RETURNS = 0.08  # share of TDOAs that jump by more than 0.5 m and back; healthy 0.04 at most
+# share of TDOAs that jump by more than 0.5 m and back, healthy 0.04 at most; fewest of these
+RETURNS, ENOUGH = 0.08, 100
+# The same of pairs heard after 0.1 to 1 s, where these are more than SLOW times those heard
+# sooner: at low rates. Healthy 0.016 at most; two tags with 14 TDOAs/s each 0.035 at least, but for
+# one of 32 pairs of flights.
+LATER_RETURNS, SLOW = 0.03, 1.75
 EVEN = 0.6  # share of the pairs, heard in both orders, with equal signs; healthy 0.1
 ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
 # share and number of TDOAs of a window at its largest value; healthy 0.011, and 3
@@ -170,15 +175,6 @@ SHARES = (
         _frozen,
     ),
     Limit(
-        "two_tags",
-        ERROR,
-        "two tags share uwb/tdoa",
-        "{:.0f} % leap by more than 0.5 m and back within 0.1 s",
-        "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2",
-        RETURNS,
-        lambda windows: share_of(windows, "returns", "successive"),
-    ),
-    Limit(
         "tdoa_one_sign",
         ERROR,
         "the sign of the TDOAs does not follow the order of the anchors",
@@ -188,6 +184,30 @@ SHARES = (
         _even,
     ),
 )
+
+
+def two_tags(windows: list[TdoaWindow]) -> Iterator[Finding]:
+    """Yield a Finding if TDOAs of pairs jump from one tag to another and back, soon or later."""
+    soon, later, successive = 0.0, 0.0, total(windows, "successive")
+    if successive >= ENOUGH:
+        soon = share_of(windows, "returns", "successive")
+    if total(windows, "later") >= max(ENOUGH, SLOW * successive):
+        later = share_of(windows, "later_returns", "later")
+    if soon > RETURNS or later > LATER_RETURNS:
+        yield Finding(
+            "two_tags",
+            ERROR,
+            cause="two tags share uwb/tdoa",
+            evidence=(
+                f"{100.0 * soon:.0f} % leap by more than 0.5 m and back within 0.1 s, "
+                f"{100.0 * later:.0f} % farther than a tag moves within 1 s"
+            ),
+            remedy=(
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2"
+            ),
+            value=max(soon, later),
+        )
 
 
 def rounded(windows: list[TdoaWindow]) -> Iterator[Finding]:
@@ -237,6 +257,7 @@ RULES = (
     fixed_step,
     impossible,
     *SHARES,
+    two_tags,
     rounded,
     clipped,
     heard,

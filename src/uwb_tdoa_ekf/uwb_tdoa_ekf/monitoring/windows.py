@@ -25,8 +25,10 @@ JUMP_LIMIT = 1.0
 NO_STAMP = 1e12  # s; no clock has this value
 NO_SAMPLE = 1e9  # no inertial sensor returns this, in any unit
 NO_TDOA = 1e15  # no radio returns this, in any unit
-FOLLOWING = 0.1  # s between two TDOAs of a pair below which they are successive
+# s between two TDOAs of a pair below which they are successive, and below which a jump shows
+FOLLOWING, LATER = 0.1, 1.0
 LEAP = 0.5  # m between successive TDOAs of a pair that no flying tag reaches in that time
+FASTEST = 3.0  # m/s, change of a TDOA beyond which later ones jump
 # m by which a TDOA may exceed the distance of its anchors before it is impossible
 BEYOND = 1.0
 # m, resolutions to which a driver might round; the radio's tick is 4.69 mm
@@ -334,8 +336,10 @@ class TdoaWindow(NamedTuple):
     returns : int
         Successive, with a jump of more than LEAP back to the value before, which came in this window
         or in the one before.
+    later, later_returns : int
+        The same of those within LATER of the last one of the pair, with a jump beyond FASTEST.
     opposed : int
-        TDOAs longer than LEAP whose pair came in the other order less than FOLLOWING before.
+        Pairs that are heard in both orders, with means beyond LEAP.
     even : int
         Opposed, with equal signs in both orders.
     size : float
@@ -363,6 +367,8 @@ class TdoaWindow(NamedTuple):
     successive: int
     repeated: int
     returns: int
+    later: int
+    later_returns: int
     opposed: int
     even: int
     size: float
@@ -406,16 +412,16 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
     before_last = np.full(len(d), np.nan)
     third = pair[order[2:]] == pair[order[:-2]]
     before_last[order[2:][third]] = d[order[:-2][third]]
-    soon = (pair[here] == pair[last]) & _follows(t[here] - t[last]) & (here >= own)
-    here, last = here[soon], last[soon]
-    step = np.abs(d[here] - d[last])
-    leaps = step > LEAP
-    returns = leaps & (np.abs(d[here] - before_last[here]) < 0.5 * LEAP)
+    since = t[here] - t[last]
+    soon = (pair[here] == pair[last]) & (since >= 0.0) & (since < LATER) & (here >= own)
+    here, last, since = here[soon], last[soon], since[soon]
+    step, later = np.abs(d[here] - d[last]), since >= FOLLOWING
+    leaps = step > LEAP + FASTEST * np.where(later, since, 0.0)
+    back = np.abs(d[here] - before_last[here])
+    returns = leaps & (back < 0.5 * np.where(later, step, LEAP))
 
-    one, other = _opposite(np.sort(order), a, b)
-    opposed = _follows(t[one] - t[other]) & (np.abs(d[one]) > LEAP) & (one >= own)
-    one, other = one[opposed], other[opposed]
-    even = np.abs(d[one] - d[other]) < np.abs(d[one] + d[other])
+    either = np.minimum(a, b) * len(positions) + np.maximum(a, b)
+    opposed, even = _both_orders(either[mine], (a < b)[mine], d[mine])
 
     latest = order[np.flatnonzero(np.diff(pair[order], append=-1))]
     newest = t[np.isfinite(t)][-1:]
@@ -428,17 +434,19 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
         invalid=int(invalid[own:].sum()),
         impossible=int((size > apart + BEYOND).sum()),
         duplicates=int((duplicates >= own).sum()),
-        successive=len(here),
-        repeated=int((step == 0.0).sum()),
-        returns=int(returns.sum()),
-        opposed=len(one),
-        even=int(even.sum()),
+        successive=int((~later).sum()),
+        repeated=int((step[~later] == 0.0).sum()),
+        returns=int(returns[~later].sum()),
+        later=int(later.sum()),
+        later_returns=int(returns[later].sum()),
+        opposed=opposed,
+        even=even,
         size=float(size.mean()) if len(size) else 0.0,
         ceiling=ceiling,
         hits=int((size == ceiling).sum()),
         grids=(np.abs(off_grid) < ON_MULTIPLE).sum(axis=0) / max(len(mine), 1),
         heard=np.bincount(np.concatenate([a[mine], b[mine]]), minlength=len(positions)),
-        steps=step[leaps],
+        steps=step[leaps & ~later],
         latest=np.column_stack([a[latest], b[latest], d[latest]]),
     )
 
@@ -464,33 +472,26 @@ def _by_pair(
     return order[~twice], order[twice]
 
 
-def _follows(since: np.ndarray) -> np.ndarray:
-    """Return whether TDOAs are successive; `since` (n,), in s, since the one before."""
-    return (since >= 0.0) & (since < FOLLOWING)
+def _both_orders(pair: np.ndarray, forward: np.ndarray, d: np.ndarray) -> tuple[int, int]:
+    """Return how many pairs are heard in both orders, and in how many both have the same sign.
 
-
-def _opposite(rows: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return TDOAs and the last one before each that has the same anchors in the other order.
+    A pair counts if its mean exceeds LEAP in both orders.
 
     Parameters
     ----------
-    rows : (k,) int array
-        TDOAs in the order of arrival.
-    a, b : (n,) int array
-        Rows of their anchors.
-
-    Returns
-    -------
-    one, other : (m,) int array
-        From `rows`.
+    pair : (n,) int array
+        Number of the pair of each TDOA, the same in both orders.
+    forward : (n,) array of bool
+        Whether the anchor with the lower row comes first.
+    d : (n,) array
+        Values, in m.
     """
-    low, high = np.minimum(a, b)[rows], np.maximum(a, b)[rows]
-    order = np.lexsort((high, low))
-    both = low[order] * (1 + high.max(initial=0)) + high[order]
-    forward = (a < b)[rows[order]]
-    place = np.arange(len(order))
-    last_forward = np.maximum.accumulate(np.where(forward, place, -1))
-    last_backward = np.maximum.accumulate(np.where(forward, -1, place))
-    other = np.where(forward, last_backward, last_forward)
-    found = other >= np.searchsorted(both, both)  # of the same anchors
-    return rows[order[found]], rows[order[other[found]]]
+    _, place = np.unique(pair, return_inverse=True)
+    size = place.max(initial=-1) + 1
+    means = []
+    for some in (forward, ~forward):
+        count = np.bincount(place[some], minlength=size)
+        means.append(np.bincount(place[some], d[some], size) / np.where(count, count, np.nan))
+    one, other = means
+    opposed = (np.abs(one) > LEAP) & (np.abs(other) > LEAP)
+    return int(opposed.sum()), int((opposed & (one * other > 0.0)).sum())

@@ -30,6 +30,7 @@ from uwb_tdoa_ekf.monitoring.explain import (
     SCALE,
     Unexplained,
     in_words,
+    innovations,
     unexplained,
 )
 from uwb_tdoa_ekf.monitoring.finding import Finding
@@ -431,6 +432,12 @@ class OrderedRecording:
             samples, usable = imu_rows(self.imu.t, self.imu.gyro, self.imu.accel)
             samples = samples[usable]
         return unexplained(rows, self.anchors.positions, samples, config, limit)
+
+    def innovations(self) -> np.ndarray:
+        """Return the innovations of a filter without the IMU, (n,) m, NaN for unusable TDOAs."""
+        positions = self.anchors.positions
+        rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d, self.tdoa.variance)
+        return innovations(new_state(positions), rows, positions)
 
     @cached_property
     def survey_fit(self) -> SurveyFit:

@@ -16,13 +16,10 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import UNITS as SURVEY_UNITS, Anchors
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
-from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, innovations
+from uwb_tdoa_ekf.monitoring.explain import SCALE, compare
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.monitoring.judge import Judge, exchanged, wrong_scale, wrong_sign
-from uwb_tdoa_ekf.monitoring.windows import Cutter, tdoa_window
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from .ordered import (
     LEAST_MOTION,
@@ -135,18 +132,14 @@ def judged(recording: OrderedRecording) -> Iterator[Trial]:
 
 def judge_of(recording: OrderedRecording) -> Judge:
     """Return the Judge of the part of a recording in which the tag moves most."""
-    brief = recording.part(LONG)
-    doubtful = None
+    brief, doubtful = recording.part(LONG), None
     if len(recording.anchors) > MANY:
         doubtful = recording.anchors.index(_far_off(recording.part(SHORT))).tolist()
-    judge, cutter, unknown = (
-        Judge(brief.anchors, None, doubtful),
-        Cutter(),
-        np.full(len(brief.tdoa), np.nan),
-    )
-    for window in cutter.cut(brief.tdoa.t, unknown, *brief.rows(), brief.tdoa.d):
-        judge.add(tdoa_window(*window, brief.anchors.positions).latest)
-    return judge
+    streams = StreamRules(brief.anchors)
+    streams.judge = Judge(brief.anchors, None, doubtful)
+    tdoa = brief.tdoa
+    streams.feed_tdoa(tdoa.t, np.full(len(tdoa), np.nan), tdoa.a, tdoa.b, tdoa.d)
+    return streams.judge
 
 
 def scaled_survey(recording: OrderedRecording) -> Iterator[Trial]:
@@ -226,10 +219,7 @@ def renumbered_ids(recording: OrderedRecording) -> Iterator[Trial]:
 
 def _far_off(recording: OrderedRecording) -> np.ndarray:
     """Return the ids of anchors with much larger innovations than most: their ids may be exchanged."""
-    (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
-    off = np.abs(
-        innovations(new_state(positions), structured(TDOA, tdoa.t, a, b, tdoa.d), positions)
-    )
+    (a, b), off = recording.rows(), np.abs(recording.innovations())
     rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])  # of known anchors
     mine = [off[((a == row) | (b == row)) & np.isfinite(off)] for row in rows.tolist()]
     each = np.array([np.median(some) if len(some) >= FEWEST else 0.0 for some in mine])
@@ -277,8 +267,7 @@ def inverted_pairs(recording: OrderedRecording) -> Iterator[Trial]:
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs, [(a, b)], most of whose TDOAs are nearer to the negative of the prediction."""
     tdoa = recording.tdoa
-    run = run_offline(recording.flight(), FilterConfig(use_imu=False))
-    predicted = tdoa.d - run.residuals.innovation
+    predicted = tdoa.d - recording.innovations()
     counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
     other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
     wrong = []
