@@ -249,6 +249,12 @@ def typing_error(recording, rng, other):
     return _moved(recording, positions)
 
 
+@mistake("three anchors late by 1 m", "anchors_late", "survey_misfit", alone=True)
+def late_anchors(recording, rng, other):
+    tdoa, late = recording.tdoa, rng.choice(recording.anchors.ids, 3, replace=False)
+    return _tdoa(recording, d=tdoa.d + np.isin(tdoa.b, late) - np.isin(tdoa.a, late))
+
+
 @mistake("x and y of the survey exchanged", "survey_mirrored", "imu_axes", needs="imu", alone=True)
 def mirrored_survey(recording, rng, other):
     return _moved(recording, recording.anchors.positions[:, [1, 0, 2]])

@@ -21,7 +21,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.checking import imu_rules, tdoa_rules
-from uwb_tdoa_tools.checking.check import check
+from uwb_tdoa_tools.checking.check import _misfit, _try_corrections, check
 from uwb_tdoa_tools.checking.coverage import sides_of
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import (
@@ -65,6 +65,7 @@ class Fit(list):
     """A survey that does not fit in ten windows."""
 
     before, all_moved, radio_loss, positions, flat = 0.48, (0.21, None), 1.0, [0] * 8, False
+    thin = False
 
     def __init__(self, seconds):
         super().__init__(range(10))
@@ -379,6 +380,31 @@ def test_every_command_refuses_the_cases(command, shared, tmp_path, monkeypatch,
         assert main([str(shared / "data/flights/0426/0426-traj5"), *survey, *rest]) == 2
         assert said in capsys.readouterr().err
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def with_errors(recording, errors):
+    """Return an OrderedRecording with errors (n, N) m of the anchors at each TDOA."""
+    n, (a, b) = np.arange(len(recording.tdoa)), recording.rows()
+    return recording.with_tdoa(d=recording.tdoa.d + errors[n, b] - errors[n, a])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_several_late_anchors_are_named_and_none_is_moved(seed):
+    sound = OrderedRecording.of(recording(seed))
+    late = np.isin(np.arange(len(sound.anchors)), [1, 4, 6]).astype(float)
+    wrong = with_errors(sound, np.tile(late, (len(sound.tdoa), 1)))
+    found, _ = _try_corrections(wrong, set(), ())
+    assert [one.rule for one in found] == ["anchors_late"]
+
+
+def test_errors_that_depend_on_the_place_blame_no_anchor():
+    made = recording(0)
+    sound, truth = OrderedRecording.of(made), made.truth
+    p = np.stack([np.interp(sound.tdoa.t, truth.t, column) for column in truth.p.T], axis=1)
+    slopes = 0.4 * np.random.default_rng(5).standard_normal((len(sound.anchors), 3))
+    wrong = with_errors(sound, (p - p.mean(axis=0)) @ slopes.T)
+    assert "radio_errors" in [one.rule for one in _misfit(wrong.survey_fit)]
+    assert not list(tdoa_rules.moved_anchor(wrong))
 
 
 @pytest.mark.slow

@@ -86,6 +86,7 @@ EXPLAINS = {
     "ids_exchanged": {"tdoa_large", "tdoa_outliers"},
     "survey_other": {"tdoa_large", "tdoa_outliers"},
     "survey_misfit": {"tdoa_large", "tdoa_outliers"},
+    "anchors_late": {"tdoa_large", "tdoa_outliers"},
     "tdoa_one_sign": {"tdoa_one_sign"},
     "survey_scale": {"tdoa_large", "tdoa_outliers"},
 }
@@ -291,7 +292,7 @@ def _try_corrections(
     if (
         ordered.imu is not None
         and not names & WITHOUT_IMU
-        and not any(f.rule == "survey_misfit" for f in found)
+        and not any(f.rule in ("survey_misfit", "anchors_late") for f in found)
     ):
         finding = imu_rules.find_imu_mistake(ordered)
         found += [finding] if finding else []
@@ -299,11 +300,41 @@ def _try_corrections(
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
-    """Yield a finding if the survey fits much better with several of its anchors moved."""
+    """Yield a finding if the survey fits much better with several of its anchors moved, or late."""
+    if tdoa_rules.is_of_delays(fit):
+        yield Finding(
+            "anchors_late",
+            ERROR,
+            cause="several anchors are late or early: no anchor needs to stand elsewhere",
+            evidence=(
+                f"{100.0 * (1.0 - fit.late_loss / fit.before):.0f} % less stays unexplained with a "
+                "delay of each anchor"
+            ),
+            remedy="calibrate the delays: survey, or diagnose; look what stands before the anchors",
+            value=fit.late_loss,
+        )
+        return
     gain = tdoa_rules.gained(fit)
     enough = fit.seconds >= tdoa_rules.SHORTEST and len(fit.positions) <= MANY and not fit.flat
     poor = enough and fit.before > tdoa_rules.POOR
-    if gain is None and not poor and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
+    unclear = gain is None and not poor and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN
+    if unclear and tdoa_rules.is_of_radio(fit):
+        more = 100.0 * (1.0 - fit.radio_loss / fit.all_moved[0])
+        yield Finding(
+            "radio_errors",
+            WARNING,
+            cause="the errors of the TDOAs depend on the place of the tag: no anchor is blamed",
+            evidence=(
+                "errors of each anchor that change with the place explain more than anchors "
+                f"elsewhere: {more:.0f} % less stays unexplained"
+            ),
+            remedy=(
+                "look what stands between tag and anchors: a body, metal, a wall; "
+                "localize --zones shows where"
+            ),
+            value=more,
+        )
+    elif unclear:
         yield Finding(
             "misfit_unclear",
             NOTE,
@@ -343,7 +374,10 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
         yield Finding(
             "survey_misfit",
             ERROR,
-            cause="the survey does not fit: of another room, or anchors have been moved",
+            cause=(
+                "the survey does not fit: of another room, or anchors have been moved"
+                + ", or several are late" * (fit.before - fit.late_loss > tdoa_rules.ALONE * gain)
+            ),
             evidence=evidence,
             remedy=OTHER_SURVEY,
             value=gain,

@@ -52,11 +52,14 @@ TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about its first positio
 STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; most TDOAs of a window that count as independent
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
-# m, standard deviation of errors of the radio, and of their change over NEAR, m, of an anchor
-RADIO, NEAR = 0.3, 2.0
+# m, standard deviation of errors of the radio, and of their change over NEAR, m, of an anchor; number
+# of functions of the place of which they consist: a constant, which is a delay, and three slopes
+RADIO, NEAR, FUNCTIONS = 0.3, 2.0, 4
 # thickness of positions over their size below which they lie in a plane; anchors of the measured
 # rooms have 0.2 and more
 FLAT_SHARE = 0.08
+# the same of the places of a tag: persons and rovers 0.13 at most, measured flights 0.26 at least
+THIN_SHARE = 0.2
 # m of `second_principal_std`; measured flights 0.50 at least, also with ids swapped, a hovering tag
 # 0.16 at most
 LEAST_MOTION = 0.3
@@ -91,7 +94,7 @@ class SurveyFit:
         """
         self.positions = positions
         # columns of each window, and (6,) m and m/s of the tag at its end
-        self._windows, self._start = [], []
+        self._windows, self._start, self._errors = [], [], np.zeros((len(positions), FUNCTIONS))
         config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
         workspace.set_bounds(state.record.extent, config.workspace_margin, box)  # writes box
         rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
@@ -145,43 +148,61 @@ class SurveyFit:
         It is the mean of both halves. Errors at positions where the tag stays for a while are no errors of
         the survey.
         """
+        return self._held_out(0)
+
+    @cached_property
+    def held_out_gain_of_radio(self) -> float:
+        """Return the same with errors of each anchor that are linear functions of the place."""
+        return self._held_out(FUNCTIONS)
+
+    @cached_property
+    def late_loss(self) -> float:
+        """Return the loss with a delay of each anchor."""
+        return self.solve(functions=1)[0]
+
+    def _held_out(self, functions: int) -> float:
         half = len(self) // 2
         parts = [self._part(slice(None, half)), self._part(slice(half, None))]
-        return float(
-            np.mean(
-                [
-                    test.before - test._at(fitted.all_moved[1])
-                    for fitted, test in (parts, parts[::-1])
-                ]
-            )
-        )
+        gains = [
+            test.before - test._at(fitted.solve(functions=functions)[1])
+            for fitted, test in (parts, parts[::-1])
+        ]
+        return float(np.mean(gains))
 
     @cached_property
     def radio_loss(self) -> float:
         """Return the loss with an error of each anchor that is a linear function of the place."""
-        return self.solve(radio=True)[0]
+        return self.solve(functions=FUNCTIONS)[0]
 
     @property
     def flat(self) -> bool:
         """Return whether the anchors that are heard lie in one plane: nothing is told across it."""
         return not len(self) or is_flat(self.positions[self.heard])
 
+    @cached_property
+    def thin(self) -> bool:
+        """Return whether the tag moves in a plane: its anchors are told apart poorly across it."""
+        size, thickness = size_and_thickness(self.places)
+        return thickness < THIN_SHARE * size
+
     def _part(self, windows: slice) -> SurveyFit:
         """Return the same fit for some of the windows."""
         part = copy(self)
-        part.__dict__.pop("all_moved", None)
         part._windows, part._start = self._windows[windows], self._start[windows]
         part.before, _ = part.solve([])
         return part
 
-    def _at(self, positions: np.ndarray) -> float:
-        """Return the loss with the anchors at positions (N, 3) m."""
+    def _at(self, fitted: np.ndarray) -> float:
+        """Return the loss with the anchors at positions (N, 3) m, or with errors (N, FUNCTIONS)."""
         other = copy(self)
-        other.positions = positions
+        if fitted.shape[1] == 3:
+            other.positions = fitted
+        else:
+            other._errors = fitted
         return other.solve([])[0]
 
     def solve(
-        self, free: Sequence[int] | None = None, radio: bool = False
+        self, free: Sequence[int] | None = None, functions: int = 0
     ) -> tuple[float, np.ndarray]:
         """Move the tag, and the anchors in `free`, to the least loss.
 
@@ -192,20 +213,21 @@ class SurveyFit:
         Parameters
         ----------
         free : sequence of int or None
-            Rows of the free anchors; None for all.
-        radio : bool
-            Leave the anchors where they are, and fit errors of their signals.
+            Rows of the anchors that are moved, or have errors; None for all.
+        functions : int
+            If not 0, leave the anchors where they are, and fit errors of their signals: the first of
+            the FUNCTIONS of the place.
 
         Returns
         -------
         loss : float
             Remaining loss, 0 to 1.
         anchors : (N, 3) array
-            Positions, m, world; with `radio` (N, 4) errors and their slopes, m.
+            Positions, m, world; with `functions` (N, functions) errors and their slopes, m.
         """
         count = len(self.positions)
         moved = np.ones(count, dtype=bool) if free is None else np.isin(range(count), free)
-        size, std = (4, RADIO) if radio else (3, PRIOR)
+        size, std = (functions, RADIO) if functions else (3, PRIOR)
         columns = np.flatnonzero(np.repeat(moved, size))  # free unknowns
         unknown, start = np.zeros((count, size)), [x.copy() for x in self._start]
         # In a hall each window has few of the anchors.
@@ -237,7 +259,7 @@ class SurveyFit:
             unknown.reshape(-1)[columns] += step
             for x, solved, own in zip(start, eliminated, heard_columns):
                 x += np.clip(solved[:, -1] - solved[:, :-1] @ step[own], -2.0, 2.0)
-        return self._loss(start, unknown), unknown if radio else self.positions + unknown
+        return self._loss(start, unknown), unknown if functions else self.positions + unknown
 
     def _loss(self, states: list[np.ndarray], unknown: np.ndarray) -> float:
         """Return the mean Geman-McClure loss over the windows."""
@@ -251,7 +273,7 @@ class SurveyFit:
         )
 
     def _place(self, x: np.ndarray) -> np.ndarray:
-        """Return the functions of the place of which errors of the radio consist, (4,)."""
+        """Return the FUNCTIONS of the place of which errors of the radio consist, (4,)."""
         return np.append(1.0, (x[:3] - self.positions.mean(axis=0)) / NEAR)
 
     def _residual(
@@ -260,12 +282,13 @@ class SurveyFit:
         """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
 
         The times are relative to the end of the window. `unknown` is as of `solve`, (N, 3) by which
-        the anchors are moved, or (N, 4).
+        the anchors are moved, or (N, 1) or (N, 4).
         """
         t, a, b, d = window
-        radio = unknown.shape[1] == 4
-        anchors = self.positions if radio else self.positions + unknown
-        late = unknown @ self._place(x) if radio else np.zeros(len(unknown))
+        size = unknown.shape[1]
+        anchors = self.positions + unknown if size == 3 else self.positions
+        place = self._place(x)
+        late = self._errors @ place + (0.0 if size == 3 else unknown @ place[:size])
         before = t - t[-1]
         tag = x[:3] + before[:, None] * x[3:]
         from_a, from_b = tag - anchors[a], tag - anchors[b]
@@ -284,8 +307,8 @@ class SurveyFit:
         residual, from_a, from_b, before = self._residual(x, window, unknown)
         by_position, size = from_b - from_a, unknown.shape[1]
         by_tag = np.column_stack([by_position, before[:, None] * by_position])
-        if size == 4:
-            from_b = np.tile(-self._place(x), (len(residual), 1))
+        if size != 3:
+            from_b = np.tile(-self._place(x)[:size], (len(residual), 1))
             from_a = from_b
         by_anchors, number = np.zeros((len(residual), int(moved.sum()), size)), np.cumsum(moved) - 1
         for ends, by_end in ((window[1], from_a), (window[2], -from_b)):

@@ -39,12 +39,22 @@ FIRST = {
     "ids_exchanged",
 }
 # Mistakes for which nobody should blame the ground truth, or an anchor that stands where it should.
-BEFORE_TRUTH = FIRST | {EXCHANGED, CHANGED, DISPLACED, "survey_misfit", "anchor_moved", "pair_sign"}
+BEFORE_TRUTH = FIRST | {
+    EXCHANGED,
+    CHANGED,
+    DISPLACED,
+    "survey_misfit",
+    "anchor_moved",
+    "anchors_late",
+}
+BEFORE_TRUTH |= {"pair_sign"}
 # What an anchor that changes on the way, or two that are exchanged then, may be taken for, where
 # the whole recording is asked.
 TAKEN_FOR = {
     "survey_misfit",
     "misfit_unclear",
+    "radio_errors",
+    "anchors_late",
     "anchor_moved",
     "pair_sign",
     "tdoa_large",
