@@ -148,10 +148,13 @@ def judge_of(recording: OrderedRecording) -> Judge:
 
 
 def scaled_survey(recording: OrderedRecording) -> Iterator[Trial]:
-    """Yield trials with the survey in another unit.
+    """Yield trials with the survey in another unit, unless the anchors lie in a plane.
 
-    (If the TDOAs show it directly, the rules of streams have reported it before.)
+    (If the TDOAs show it directly, the rules of streams have reported it before.) Beside a plane a
+    smaller survey with a tag outside explains more than the right one.
     """
+    if recording.survey_fit.flat:
+        return
     for name, factor in SURVEY_UNITS.items():
         yield Trial(recording.scaled(factor), wrong_scale(name, factor, ""))
 
