@@ -159,6 +159,20 @@ def late(flight, rows=(0, 2), since=40.0, lasts=5.0, by=1.5):
     return replace(flight, tdoa=replace(tdoas, d=d))
 
 
+def misled(flight, fault, since=28.0, lasts=8.0):
+    """Return the Flight with wheels that are wrong from `since` s after its begin, for `lasts` s.
+
+    They "stick", "spin" 0.6 m/s too fast, or turn "twice" as fast.
+    """
+    wheels, t = flight.velocity, flight.velocity.t - flight.truth.t[0]
+    during, v, yaw_rate = (t > since) & (t < since + lasts), wheels.v.copy(), wheels.yaw_rate.copy()
+    factor = {"stick": 0.0, "spin": 1.0, "twice": 2.0}[fault]
+    v[during] *= factor
+    yaw_rate[during] *= factor
+    v[during, 0] += 0.6 * (fault == "spin")
+    return replace(flight, velocity=replace(wheels, v=v, yaw_rate=yaw_rate))
+
+
 def yaw_of(q):
     """Return the yaws (n,), in rad, of quaternions (n, 4)."""
     x, y, z, w = q.T

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 from live import assert_same, feed, joined, messages, send
 import numpy as np
 import pytest
-from rovers import HEIGHT, HEIGHT_STD, Errors, drive, late, yaw_of
+from rovers import HEIGHT, HEIGHT_STD, Errors, drive, late, misled, yaw_of
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.sensors import Velocity
@@ -298,6 +298,51 @@ def test_a_rover_that_is_lost_is_found(config=WHEELS):
     assert found.xy[0] > 2.0 and estimator.recoveries >= 1
     again = found.t[found.xy > 0.5].max() - begin - 25.0
     assert 0.5 * RIVAL_TIME < again < RIVAL_TIME + 4.0
+
+
+# --- TDOAs that show wrong wheels ---
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["stick", "spin", "twice"])
+@pytest.mark.parametrize("every", [1, 5])
+def test_wheels_that_tdoas_contradict_are_left_out_named_and_taken_again(fault, every):
+    """Without an IMU, at 100 and 20 TDOAs/s, the wheels are wrong from 28 to 36 s."""
+    drove = drive(1, SHORT)
+    flight = misled(replace(drove, tdoa=rows_of(drove.tdoa, slice(None, None, every))), fault)
+    estimator, begin, named = Estimator(flight.anchors, WHEELS), flight.truth.t[0], []
+
+    def look():
+        if "contradict the wheels" in (estimator.unsure or ""):
+            named.append(estimator.newest - begin)
+        return True
+
+    odometry, _ = feed(estimator, flight, advance=look)
+    found = Errors(flight, odometry, SETTLED)
+    step = np.median(np.diff(found.t))
+    assert np.sum(found.xy > 0.5) * step < 2.0
+    assert 28.5 < min(named) < 31.0 and max(named) < 40.0
+    wheels = run_offline(flight, WHEELS).sensors["velocity"]
+    t, used = flight.velocity.t - begin, wheels["verdict"] == USED
+    assert used[(t > 31.0) & (t < 35.0)].mean() < 0.1 and used[t > 41.0].mean() > 0.8
+
+
+def test_few_tdoas_hold_wheels_without_an_imu():
+    """The yaw of the start is wrong for a while; before, the wheels then led 8 m away."""
+    drove = drive(0, SHORT)
+    flight = replace(drove, tdoa=rows_of(drove.tdoa, slice(None, None, 5)))
+    assert errors(flight, replace(WHEELS, planar=False)).xy.max() < 0.4
+
+
+def test_wheels_show_a_wrong_yaw():
+    """A yaw that is told wrong is found again, with an IMU and without."""
+    flight = drive(3, 30.0)
+    for config in (PLANAR, WHEELS):
+        told = replace(
+            config, initial_yaw=float(yaw_of(flight.truth.q)[0]) + 2.0, initial_yaw_std=0.1
+        )
+        found = errors(flight, told, 10.0)
+        assert np.degrees(np.abs(found.yaw)).max() < 20.0
 
 
 # --- parts ---

@@ -190,6 +190,8 @@ class Estimator:
             )
         if ekf.t < ekf.height.ignored_until:
             return "TDOAs contradict the range finder, and it is not used: check it, height_std"
+        if ekf.velocity.contradicted:
+            return "TDOAs contradict the wheels, and they are not used: check if they slip or stick"
         return None
 
     @property

@@ -73,8 +73,8 @@ LEAST_LENGTH = 3.0
 LINEAR_RANGE = 1.0
 
 # Most records in a history per TDOA: its update, workspace, position at rest, another hypothesis,
-# starts or recoveries with an opened attitude, an opened yaw.
-RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 3 + 2
+# starts or recoveries with an opened attitude, an opened yaw, a turned yaw.
+RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 3 + 2 + 1
 RECORDS_OF_REST = 3  # one per axis
 # a range has the same number; a velocity has one per component, plus an opened yaw
 RECORDS_OF_SENSOR = RECORDS_OF_TDOA
@@ -318,6 +318,11 @@ def _prepare(
             stationarity.check_stationarity(ekf, anchors, parameters, window, t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             stationarity.update_zero_velocity(ekf, t, records)
+    if t >= ekf.velocity.next_look:
+        window = initialization.recent(ekf, velocity.SECONDS)
+        angle = velocity.compare_path(ekf, anchors, window, parameters.tdoa_std, t)
+        if angle != 0.0:
+            initialization.turn_yaw(ekf, angle, records)
     ekf.tdoa_rate += 1.0 - min(1.0, t - ekf.last_tdoa) * ekf.tdoa_rate
     if t >= ekf.next_workspace:
         initialization.update_workspace(ekf, anchors, parameters, t)
@@ -382,7 +387,8 @@ def _on_sensor(
     if sensor.kind == sensors.RANGE:
         _on_range(ekf, anchors, parameters, sensor, residual, records)
     elif ekf.running and _predict(ekf, parameters, sensor.t, records):
-        if sensor.kind == sensors.VELOCITY and not parameters.use_imu:
+        opens = not (parameters.use_imu or ekf.velocity.refused)
+        if sensor.kind == sensors.VELOCITY and opens:
             initialization.open_unknown_yaw(ekf, parameters, records)
         sensors.observe(ekf, parameters, sensor, residual, records)
     elif sensor.kind == sensors.HEIGHT:

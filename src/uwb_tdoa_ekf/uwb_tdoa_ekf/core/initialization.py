@@ -73,6 +73,7 @@ def remember(ekf: Record, tdoa: Record) -> None:
             ekf.window[i] = ekf.window[WINDOW + i]
         ekf.kept = WINDOW
     ekf.window[ekf.kept] = tdoa
+    velocity.carry(ekf.velocity, tdoa.t, ekf.window[ekf.kept].pose)
     ekf.kept += 1
 
 
@@ -702,6 +703,21 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     ekf.yaw_test.opened = ekf.t
     widen(ekf, history)
     reset_attitude(ekf, parameters, YAW_SEARCH_STD, history)
+
+
+@compiled
+def turn_yaw(ekf: Record, angle: float, history: np.ndarray) -> None:
+    """Turn the yaw by an angle, rad, because TDOAs and the path of wheels show that it is wrong."""
+    best = ekf.hypotheses[ekf.best]
+    turn_about_vertical(best.x, angle)
+    for h in range(HYPOTHESES):
+        if h != ekf.best:
+            ekf.hypotheses[h].log_weight = -np.inf
+    hypotheses.set_yaw_variance(best, hypotheses.YAW_STD**2)
+    yaw_check.forget(ekf.yaw_test)
+    ekf.yaw_test.count += 1
+    ekf.attitude_reset = True
+    widen(ekf, history)
 
 
 @compiled

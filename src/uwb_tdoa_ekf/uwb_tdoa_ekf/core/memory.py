@@ -62,6 +62,7 @@ TDOA = _record(
     # of the subtracted bias over position and velocity, m per m and m per m/s
     ("slope", float, N_STATES),
     ("state", float, N_STATES),  # linearization point of the bias, m and m/s
+    ("pose", float, 3),  # on the path of wheels, m and rad, see velocity.py; the filter sets it
 )
 # Measurement of a sensor, see sensors.py.
 SENSOR_ROW = _record(
@@ -173,6 +174,14 @@ VELOCITY = _record(
     ("yaw_rate", float),  # rad/s, of wheels
     ("yaw_rate_variance", float),  # rad^2/s^2, of this yaw rate
     ("speed_variance", float),  # m^2/s^2, of the velocity of wheels
+    # m and rad, pose on the path of wheels; s, stamps of its begin and of this pose; m/s and rad/s,
+    # velocity and rate since, all in the horizontal plane
+    ("pose", float, 3),
+    ("path_since", float),
+    ("path_until", float),
+    ("path_velocity", float, 3),
+    ("contradicted", bool),  # TDOAs contradict the path
+    ("next_look", float),  # s, stamp of the next comparison
 )
 
 # State of the yaw test, see yaw_check.py.
@@ -387,7 +396,7 @@ def new_state(
         (ekf.imu_fault_detector, ("contradicted",)),
         (ekf.height, ("heard", "changed", "used", "compared", "pulls_since", "ignored_until")),
         (ekf.barometer, ("heard", "agreed")),
-        (ekf.velocity, ("heard", "changed", "agreed")),
+        (ekf.velocity, ("heard", "changed", "agreed", "path_until", "next_look")),
         (ekf.ranged, ("t",)),
         (ekf.yaw_test, ("next_look", "opened")),
     ):

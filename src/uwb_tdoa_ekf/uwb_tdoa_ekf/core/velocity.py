@@ -7,19 +7,27 @@ inertial samples, wheels drive the prediction: the yaw turns by their yaw rate, 
 the state follows theirs. Their errors persist for CORRELATION_TIME and become process noise of
 position and yaw. With inertial samples, velocities are measurements, and the yaw rate shows the
 bias of the gyroscope.
+
+Wheels give the path of the last seconds, up to its place and heading. They are refused while TDOAs
+fit another path much better. If TDOAs fit their path, but with another heading than that of the
+filter, its yaw is wrong.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
+from . import ground
 from .height import STUCK_TIME
 from .history import add_update
 from .hypotheses import add_log_likelihood, alive
 from .memory import REJECTED, USED
-from .state import rotation
+from .state import rotation, yaw_of
 from .update import GATE, kalman_robust, project
 
 # Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md. They have no wheels:
@@ -39,6 +47,18 @@ HELD = 0.5  # s for which the last velocity of wheels drives the prediction
 STANDING = 0.1  # factor on the standard deviations of wheels that do not turn at all
 # Hz, sample rate of a gyroscope: the noise of a sample is gyro_noise * sqrt(GYRO_RATE)
 GYRO_RATE = 100.0
+# s of a path that is compared with TDOAs, their least number, and s between two comparisons
+SECONDS, FEWEST, PERIOD = (2.0, 24, 0.25)
+# Excess of the sum of squared residuals that contradicts a path: in variances of a TDOA, and as rms in
+# m, to which the deviation of the wheels over 1 s is added. In simulated drives without a fault it is
+# 61 variances with 0.05 m, or 25 with 0.15 m.
+SHOWN, LARGE = (30.0, 0.1)
+SCALES = (0.85, 1.0, 1.15)  # of a velocity that is right
+LED = 0.3  # m from TDOAs beyond which wrong wheels have led the filter away
+HEADINGS = 2.0 * math.pi / 48.0 * np.arange(48)  # rad
+# entries of a fit with any acceleration and of one along the path, see `_accumulate`
+FREE, PATH = np.array([0, 1, 2, 3, 4, 5, 6, 9]), np.array([0, 3, 6, 7, 8, 10])
+SWEEPS, COARSE = (7, 2.0)  # Gauss-Newton steps, and m, limit of the residuals in the first
 
 
 @compiled
@@ -65,6 +85,8 @@ def observe(
     _complete(sensor, parameters)
     of_wheels = sensor.std[YAW_RATE] <= LONGEST_STD
     frozen = _repeats(state, sensor) and not ekf.quiet
+    if of_wheels:
+        _extend_path(ekf, sensor)
     state.heard = sensor.t
     leads = of_wheels and not ekf.sensed
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
@@ -72,7 +94,8 @@ def observe(
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
     # simulated wheels turn evenly, so they may repeat values
     stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))
-    state.refused = state.nis > (AGREES if state.refused else DISAGREES) or stuck
+    disagrees = state.nis > (AGREES if state.refused else DISAGREES)
+    state.refused = disagrees or stuck or state.contradicted
     residual.weight, residual.verdict = 0.0, REJECTED
     if state.refused or worst > GATE**2:
         return
@@ -120,7 +143,144 @@ def agrees(state: Record, t: float) -> bool:
 
     Slip ends within SLIP seconds, so older agreement does not count.
     """
-    return t - state.agreed < SLIP
+    return not state.refused and t - state.agreed < SLIP
+
+
+@compiled
+def carry(state: Record, t: float, pose: np.ndarray) -> None:
+    """Fill in the pose to which the last velocity of a VELOCITY state leads at stamp t (s).
+
+    pose (3,) is x and y in m and the heading in rad, in the frame of the path.
+    """
+    vx, vy, rate = state.path_velocity[0], state.path_velocity[1], state.path_velocity[2]
+    dt = min(t - state.path_until, HELD)
+    heading = state.pose[2] + 0.5 * dt * rate
+    c, s = math.cos(heading), math.sin(heading)
+    pose[0] = state.pose[0] + dt * (c * vx - s * vy)
+    pose[1] = state.pose[1] + dt * (s * vx + c * vy)
+    pose[2] = state.pose[2] + dt * rate
+
+
+@compiled
+def _extend_path(ekf: Record, sensor: Record) -> None:
+    """Extend the path of wheels to the stamp of a velocity.
+
+    The gyroscope turns it, or without inertial samples the yaw rate of the wheels.
+    """
+    state, x, R = ekf.velocity, ekf.hypotheses[ekf.best].x, ekf.transition.rotation
+    carry(state, sensor.t, state.pose)
+    if sensor.t - state.path_until > HELD or sensor.std[0] > LONGEST_STD:
+        state.path_since = sensor.t
+    state.path_until, state.path_velocity[:] = sensor.t, 0.0
+    rotation(x[6], x[7], x[8], x[9], R)
+    c, s = math.cos(yaw_of(x)), math.sin(yaw_of(x))
+    for axis in range(3):
+        u = sensor.value[axis] if sensor.std[axis] <= LONGEST_STD else 0.0
+        state.path_velocity[0] += u * (c * R[0, axis] + s * R[1, axis])
+        state.path_velocity[1] += u * (c * R[1, axis] - s * R[0, axis])
+        state.path_velocity[2] += R[2, axis] * (ekf.imu.gyro[axis] - x[13 + axis])
+    if not ekf.sensed:
+        state.path_velocity[2] = sensor.value[YAW_RATE]
+
+
+@compiled
+def compare_path(
+    ekf: Record, anchors: np.ndarray, window: np.ndarray, std: float, t: float
+) -> float:
+    """Compare the path of wheels with TDOAs, and return by which angle the yaw must turn, rad.
+
+    It is 0.0 for none. Two paths are fitted: that of the wheels, with any place and heading, and one
+    with any constant acceleration. The wheels are refused while the second is much better.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter; its velocity is updated.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    window : (n,) TDOA
+        TDOAs of the last SECONDS.
+    std : float
+        Standard deviation of a TDOA, m.
+    t : float
+        Stamp, s.
+    """
+    state, x, n = ekf.velocity, ekf.hypotheses[ekf.best].x, len(window)
+    state.next_look = t + PERIOD
+    if t - state.path_until > HELD:
+        state.contradicted = False
+        return 0.0
+    if n < FEWEST or not state.path_since < window[0].t < t - 0.75 * SECONDS:
+        return 0.0
+    fit, gram = np.zeros(7), np.zeros((11, 11))
+    fit[0], fit[3], fit[6] = x[0], x[1], x[2]
+    for sweep in range(SWEEPS):
+        step = gram[:, FREE][:7].copy()
+        ground.solve(step)
+        fit += step[:, 7]
+        _accumulate(window, anchors, x, fit, max(COARSE * 0.5**sweep, GATE * std), gram)
+    free, of_path = gram[9, 9], gram[PATH][:, PATH].copy()
+    variance = max(free / (n - 7), (0.7 * std) ** 2)
+    needed = max(SHOWN * variance, n * (LARGE**2 + state.speed_variance))
+    for k in range(3):  # the place
+        of_path -= np.outer(of_path[k] / of_path[k, k], of_path[k])
+    costs = np.array([_cost(of_path, heading) for heading in HEADINGS])
+    least = np.min(costs)
+    known = variance < std**2  # otherwise late anchors may make the difference
+    contradicted = known and least - free > (0.5 if state.contradicted else 1.0) * needed
+    away = math.hypot(np.sum(fit[:3]) - x[0], np.sum(fit[3:6]) - x[1])
+    if contradicted and not state.contradicted and agrees(state, t) and away > LED:
+        ekf.distrusted = True
+    state.contradicted = contradicted
+    heading = yaw_of(x) - window[n - 1].pose[2]
+    no_yaw = contradicted or _cost(of_path, heading) - least < needed
+    if no_yaw or state.refused or not known:
+        return 0.0
+    return HEADINGS[np.argmin(costs)] - heading
+
+
+@compiled
+def _accumulate(
+    window: np.ndarray,
+    anchors: np.ndarray,
+    x: np.ndarray,
+    fit: np.ndarray,
+    limit: float,
+    gram: np.ndarray,
+) -> None:
+    """Fill in the information of a window of TDOAs, for the paths of `compare_path`.
+
+    gram (11, 11) is the sum of squares of the entries of each TDOA: Jacobian with respect to fit (7),
+    with respect to cosine and sine of the heading (2), residual of fit, and residual of a path at x.
+    fit is three coefficients of x, three of y, and z, in m. Residuals beyond limit (m) have a smaller
+    weight.
+    """
+    first, middle, last = window[0], window[len(window) // 2], window[len(window) - 1]
+    half, p, row, entries = 0.5 * (last.t - first.t), np.empty(3), np.empty(3), np.empty(11)
+    gram[:, :] = 0.0
+    gram[6, 6], gram[6, 9] = 1.0, x[2] - fit[6]  # z is about that of the filter
+    for i in range(len(window)):
+        tdoa = window[i]
+        tau = (tdoa.t - first.t) / half - 1.0
+        powers = np.array([1.0, tau, tau**2])
+        p[0], p[1], p[2] = np.sum(powers * fit[:3]), np.sum(powers * fit[3:6]), fit[6]
+        predicted = linearized_tdoa(p, anchors[tdoa.a].position, anchors[tdoa.b].position, row)
+        dx, dy = tdoa.pose[0] - middle.pose[0], tdoa.pose[1] - middle.pose[1]
+        entries[:3], entries[3:6], entries[6] = row[0] * powers, row[1] * powers, row[2]
+        entries[7], entries[8] = row[0] * dx + row[1] * dy, row[1] * dx - row[0] * dy
+        entries[9] = tdoa.d - predicted
+        entries[10] = entries[9] + np.sum(row * (p - x[:3]))
+        gram += min(1.0, limit / max(abs(entries[9]), 1e-9)) * np.outer(entries, entries)
+
+
+@compiled
+def _cost(of_path: np.ndarray, heading: float) -> float:
+    """Return the sum of squared residuals, m^2, of the path with a heading (rad), of the best scale."""
+    least = np.inf
+    for scale in SCALES:
+        u = np.array([scale * math.cos(heading), scale * math.sin(heading), -1.0])
+        least = min(least, np.sum(np.outer(u, u) * of_path[3:, 3:]))
+    return least
 
 
 @compiled
