@@ -226,15 +226,15 @@ def compare_path(
         of_path -= np.outer(of_path[k] / of_path[k, k], of_path[k])
     costs = np.array([_cost(of_path, heading) for heading in HEADINGS])
     least = np.min(costs)
-    known = variance < std**2  # otherwise late anchors may make the difference
-    contradicted = known and least - free > (0.5 if state.contradicted else 1.0) * needed
+    if variance > std**2:  # late anchors may make the difference
+        return 0.0
+    contradicted = least - free > (0.5 if state.contradicted else 1.0) * needed
     away = math.hypot(np.sum(fit[:3]) - x[0], np.sum(fit[3:6]) - x[1])
     if contradicted and not state.contradicted and agrees(state, t) and away > LED:
         ekf.distrusted = True
     state.contradicted = contradicted
     heading = yaw_of(x) - window[n - 1].pose[2]
-    no_yaw = contradicted or _cost(of_path, heading) - least < needed
-    if no_yaw or state.refused or not known:
+    if contradicted or state.refused or _cost(of_path, heading) - least < needed:
         return 0.0
     return HEADINGS[np.argmin(costs)] - heading
 
