@@ -14,6 +14,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
 from uwb_tdoa_bias.common.robust_loss import LOSSES, weight
 from uwb_tdoa_ekf.core import noise
@@ -228,11 +230,12 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
     return state
 
 
-def stated(state, P, share=noise.SHARE, height_std=0.0):
+def stated(state, P, share=noise.SHARE, height_std=0.0, width=np.inf):
     covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    noise.fill(state.record.information, whole, share, height_std, covariance)
+    bounds = np.array([[0.0] * 3, [width] * 3])
+    noise.fill(state.record.information, whole, share, height_std, bounds, covariance)
     return covariance
 
 
@@ -276,6 +279,14 @@ def test_it_is_bounded_by_what_the_filter_knows():
     state = new_state(ANCHORS)
     np.testing.assert_allclose(stated(state, P), noise.MOST * P, rtol=1e-9)
     assert not stated(state, np.zeros((3, 3))).any()
+
+
+def test_it_is_bounded_by_the_workspace():
+    """Without anchors nothing but the workspace bounds the persisting errors."""
+    P, width = 1e6 * np.eye(3), 6.0
+    assert stated(new_state(ANCHORS), P, width=width) == pytest.approx(
+        width**2 * np.eye(3), rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("p", [[3.0, 4.0, 0.2], [1.0, 6.0, 0.5]])
@@ -353,6 +364,49 @@ def test_a_tag_that_tdoas_place_outside_is_outside(axis, off, std):
     before, after = drawn_back(axis, off, std)
     np.testing.assert_array_equal(after.x, before)
     assert after.P[axis, axis] == std**2
+
+
+def test_a_tag_inside_is_as_uncertain_as_the_workspace_is_wide_at_most():
+    positions = np.array(corners().positions)
+    bounds, ekf = bounds_of(positions), new_state(positions).record
+    middle, width = 0.5 * (bounds[0] + bounds[1]), bounds[1] - bounds[0]
+    hypothesis = ekf.hypotheses[0]
+    hypothesis.x[:3] = middle + 0.4 * width
+    hypothesis.P[:3, :3] = np.diag([100.0, 0.9, 1.1] * width) ** 2
+    changed = [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)]
+    assert changed == [True, False, True]
+    share = 1.0 / (1.0 + np.array([100.0, np.inf, 1.1]) ** 2)
+    share[1] = 1.0
+    assert hypothesis.x[:3] == pytest.approx(middle + share * 0.4 * width)
+    assert np.diag(hypothesis.P)[[0, 2]] == pytest.approx(
+        (1.0 - share[[0, 2]]) * width[[0, 2]] ** 2
+    )
+    assert hypothesis.P[1, 1] == (0.9 * width[1]) ** 2
+
+
+@pytest.mark.parametrize("rate", [27.0, 80.0])
+def test_a_trolley_just_below_the_plane_of_its_anchors_is_not_lost(rate):
+    """TDOAs do not show the height of such a tag; its uncertainty must not cost the others."""
+    angles = np.arange(8) * np.pi / 4.0 + 0.1
+    ring = np.column_stack([4.2 * np.cos(angles), 3.6 * np.sin(angles), np.full(8, 1.28)])
+    anchors, off = Anchors.from_positions(ring), []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        t = np.arange(0.01, 40.0, 1.0 / rate)
+        p = np.column_stack([2.2 * np.sin(0.36 * t + seed), 2.0 * np.sin(0.28 * t), 0.0 * t + 1.2])
+        a = rng.integers(0, 8, len(t))
+        b = (a + rng.integers(1, 8, len(t))) % 8
+        d = tdoa(p, ring[a], ring[b]) + 0.1 * rng.standard_normal(len(t))
+        late = 0.08 * rng.standard_normal(8)
+        flight = Flight(
+            "trolley", anchors, Tdoas(t, anchors.ids[a], anchors.ids[b], d + late[b] - late[a])
+        )
+        odometry = run_offline(flight, FilterConfig(use_imu=False)).odometry
+        settled = odometry.t > 5.0
+        error = odometry.p[settled] - p[np.searchsorted(t, odometry.t[settled])]
+        off.append(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))))
+        assert np.sqrt(odometry.covariance[settled, 2, 2].max()) < 10.0
+    assert max(off) < 0.6
 
 
 def drawn_back(axis, off, std):

@@ -80,6 +80,25 @@ def test_smoothing_halves_what_filtering_leaves(use_imu):
     assert np.mean(ratios) < 0.75
 
 
+def test_few_tdoas_without_imu_give_the_path_that_batch_least_squares_gives():
+    """It is linearized on itself, with the noise and the motion that all TDOAs show."""
+    errors, filtered, nees = [], [], []
+    for seed in range(6):
+        flight = fly(seed, 60.0, tdoa_rate=2.0, tdoa_std=0.1)
+        flight = flight.replaced(imu=None)
+        config = FilterConfig(use_imu=False)
+        odometry = smooth(flight, config).odometry
+        assert_covariance(odometry.covariance)
+        assert odometry.t[0] == flight.tdoa.t[0]
+        error, of_all = errors_of(flight, odometry, 5.0)
+        assert np.linalg.norm(np.diff(error, axis=0), axis=1).max() < 0.5
+        errors.append(np.mean(np.sum(error**2, axis=1)))
+        filtered.append(rmse(flight, run_offline(flight, config).odometry) ** 2)
+        nees.append(of_all.mean() / 3.0)
+    assert np.sqrt(np.mean(errors)) < 0.5 * np.sqrt(np.mean(filtered))
+    assert 0.3 < np.mean(nees) < 3.0
+
+
 @pytest.mark.parametrize("use_imu", [True, False])
 def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
     nees = []

@@ -26,6 +26,7 @@ from .core.hypotheses import yaw_offset
 from .core.memory import (
     INVALID,
     ODOMETRY,
+    POSE,
     RESIDUAL,
     SENSOR_ROW,
     TDOA,
@@ -370,6 +371,7 @@ def run_offline(
     config: FilterConfig | None = None,
     corrector: Corrector | None = None,
     records: list[np.ndarray] | None = None,
+    path: Odometry | None = None,
 ) -> Run:
     """Run bias correction and filter on a Flight and return a Run.
 
@@ -386,6 +388,9 @@ def run_offline(
         Its stored poses are cleared first. None applies no correction.
     records : list or None
         Receives the history of the filter (see engine.feed).
+    path : Odometry or None
+        Estimates of an earlier run. The TDOAs are linearized on this path, and the filter starts
+        with the first TDOA, from an unknown position. None: linearized at the prediction.
     """
     config = config or FilterConfig()
     corrector = corrector or Corrector(flight.anchors)
@@ -417,6 +422,11 @@ def run_offline(
         rows = structured(
             TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state
         )
+        if path is not None and len(rows):
+            rows["smoothed"] = True
+            rows["position"] = np.stack([np.interp(t, path.t, axis) for axis in path.p.T], axis=1)
+            if not pipeline.state.record.running:
+                pipeline.set_pose(structured(POSE, t[:1], math.nan, 0.0, math.nan))
         usable = usable_tdoas(rows, anchors.positions)
         buffer.load(TDOA_STREAM, rows if usable.all() else rows[usable])
         of_tdoas.append(batch[usable])

@@ -251,23 +251,8 @@ def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
     They equal the diagonal of the covariance from to_odometry, which describes the parameters.
     """
-    out = np.empty((len(q), 3))
-    _rotation_std(np.ascontiguousarray(q), np.ascontiguousarray(covariance), out)
-    return out
-
-
-@compiled
-def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> None:
-    # Fill out, (n, 3) rad, with the roots of the diagonal of R P R'.
-    R = np.empty((3, 3))
-    for n in range(len(q)):
-        rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
-        for axis in range(3):
-            variance = 0.0
-            for i in range(3):
-                for j in range(3):
-                    variance += R[axis, i] * covariance[n, 6 + i, 6 + j] * R[axis, j]
-            out[n, axis] = math.sqrt(variance)
+    of_axes = to_odometry(q, np.zeros((len(q), 3)), covariance)[1][:, 3:6, 3:6]
+    return np.sqrt(np.diagonal(of_axes, axis1=1, axis2=2))
 
 
 def poses_of(

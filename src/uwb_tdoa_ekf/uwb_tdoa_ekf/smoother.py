@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
+from scipy.optimize import minimize
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.flight import Flight, Truth
@@ -33,6 +34,7 @@ from .core.history import RESET
 from .core.hypotheses import YAW_STD
 from .core.memory import ODOMETRY, RESIDUAL, USED, joined, structured
 from .core.state import ERROR_STATES, MOVING_STATES, inject
+from .core.update import SMALLEST
 from .offline import Run, may_have_offset, run_offline, without_offset, without_unknown_offset
 from .results import OF_ROW, Odometry
 
@@ -50,6 +52,11 @@ LAGS = 64  # most ranges of one anchor over which their errors are compared
 FEWEST_RANGES = 4 * LAGS  # of one anchor; fewer show no correlation
 OUTLIER = 3.0  # standard deviations to which a residual is limited
 ANY_DISTANCE = 1000.0  # m, and s: longer than errors of ranges stay alike
+# Iterated smoother: TDOAs a second below which it runs, number of runs, run in which noise and motion
+# are fitted, standard deviation of their logarithms, most runs of the fit, and standard deviations at
+# which the loss bends: Gaussian noise then loses 5 % of its information.
+SPARSE, PASSES, FITTED, FACTOR, MOST_RUNS, BEND = (15.0, 10, 6, math.log(2.0), 30, 4.0)
+LARGEST_NIS = 25.0  # normalized residual squared; limits the loss of an outlier
 
 
 def smooth(
@@ -61,7 +68,8 @@ def smooth(
     yaw is unknown, the smoother uses the final yaw hypothesis from the start. An unknown common
     range offset (`range_offset_std`) is treated the same way and needs a second smoothing run. If
     the flight has ranges and no TDOAs, their correlation length is measured first
-    (`correlation_length`). The memory is 3.5 kB per update.
+    (`correlation_length`). If a tag without IMU sends few TDOAs, the smoother is iterated
+    (`_iterated`). The memory is 3.5 kB per update.
 
     Parameters
     ----------
@@ -83,7 +91,9 @@ def smooth(
     config = replace(config, **auxiliary.NONE)
     value, std = offset or (0.0, 0.0)
     nearer = flight if offset is None else without_offset(flight, value)
-    run = _smoothed_run(nearer, config, corrector)
+    run = _smoothed_run(nearer, config, corrector)[0]
+    if _is_sparse(flight, config, run.odometry):
+        return _iterated(flight, config, corrector, run)
     if nearer.range is not None and not len(nearer.tdoa) and len(run.odometry):
         corrector = corrector or Corrector(flight.anchors)
         length = correlation_length(nearer, run.odometry, corrector.effects)
@@ -92,10 +102,10 @@ def smooth(
             config = replace(
                 config, tdoa_correlation_time=seconds, tdoa_correlation_distance=ANY_DISTANCE
             )
-            run = _smoothed_run(nearer, config, corrector)
+            run = _smoothed_run(nearer, config, corrector)[0]
     if offset is None:
         return run
-    beside = _smoothed_run(without_offset(flight, value + std), config, corrector)
+    beside = _smoothed_run(without_offset(flight, value + std), config, corrector)[0]
     return replace(
         run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset
     )
@@ -148,23 +158,80 @@ def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -
     return 2.0 * float(fallen[0] if len(fallen) else LAGS)
 
 
-def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
-    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE."""
+def _is_sparse(flight: Flight, config: FilterConfig, odometry: Odometry) -> bool:
+    """Return whether a tag alone sends few TDOAs, and the filter is uncertain for half of the time.
+
+    The prediction is then too far from the tag for a linearization.
+    """
+    felt = config.use_imu and flight.imu is not None
+    alone = not felt and flight.velocity is None and flight.range is None
+    few = len(flight.tdoa) < SPARSE * (flight.end - flight.start)
+    variance = np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2)
+    return alone and few and config.adapt_noise and bool(np.mean(variance > SMALLEST**2) > 0.5)
+
+
+def _iterated(flight: Flight, config: FilterConfig, corrector: Corrector | None, run: Run) -> Run:
+    """Return a smoothed Run whose path is linearized on itself: batch least squares of all TDOAs.
+
+    The iterated Kalman smoother is a Gauss-Newton method (B. Bell, The iterated Kalman smoother as a
+    Gauss-Newton method, SIAM J. Optimization 4, 1994). Noise and random acceleration maximize the
+    likelihood of each TDOA given all others, with the configured ones as prior.
+
+    Parameters
+    ----------
+    flight, config, corrector
+        As for _smoothed_run.
+    run : Run
+        Result of _smoothed_run. Its path is the first to linearize on. Its residuals are kept.
+    """
+    config = replace(config, adapt_noise=False, recover=False, measurement_scale=BEND)
+    prior = x = np.log([config.tdoa_std, config.motion_noise])
+    path = run.odometry
+
+    def smooth_at(x: np.ndarray) -> tuple[Run, float]:
+        tdoa_std, motion_noise = np.exp(x).tolist()
+        given = replace(config, tdoa_std=tdoa_std, motion_noise=motion_noise)
+        return _smoothed_run(flight, given, corrector, path)
+
+    def loss(x: np.ndarray) -> float:
+        return smooth_at(x)[1] + 0.5 * float(np.sum((x - prior) ** 2)) / FACTOR**2
+
+    for number in range(PASSES):
+        if number == FITTED:
+            simplex = x - FACTOR * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+            options = {"maxfev": MOST_RUNS, "initial_simplex": simplex}
+            x = minimize(loss, x, method="Nelder-Mead", options=options).x
+        path = smooth_at(x)[0].odometry
+    return replace(run, odometry=path)
+
+
+def _smoothed_run(
+    flight: Flight, config: FilterConfig, corrector: Corrector | None, path: Odometry | None = None
+) -> tuple[Run, float]:
+    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE, and its loss.
+
+    The loss is minus the log likelihood of each measurement given all others. path is as for
+    run_offline.
+    """
     records: list[np.ndarray] = []
-    result = run_offline(flight, config, corrector, records)
+    result = run_offline(flight, config, corrector, records, path)
     records = [part for part in records if len(part)]
     # stamp of the record before each array of records
     before = [-math.inf, *(part["t"][-1] for part in records)]
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
-    rows = [np.empty(0, ODOMETRY)]
+    rows, total = [np.empty(0, ODOMETRY)], 0.0
     for k in reversed(range(len(records))):
         room = np.zeros(len(records[k]), ODOMETRY)
-        count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
+        count, loss = _backward(
+            records[k], before[k], config.odometry_rate, adjoint, information, room
+        )
         rows.append(room[len(room) - count :])
+        total += loss
     smoothed = np.concatenate(rows[::-1])
     if config.planar:
         plane.flatten_all(smoothed, config.parameters())
-    return replace(result, odometry=_with_persistent(Odometry.from_rows(smoothed), result.odometry))
+    odometry = _with_persistent(Odometry.from_rows(smoothed), result.odometry)
+    return replace(result, odometry=odometry), total
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
@@ -214,8 +281,8 @@ def _backward(
     adjoint: np.ndarray,
     information: np.ndarray,
     rows: np.ndarray,
-) -> int:
-    """Run the smoother backwards through records and return the number of rows written.
+) -> tuple[int, float]:
+    """Run the smoother backwards through records, and return the number of rows written and the loss.
 
     Parameters
     ----------
@@ -232,7 +299,7 @@ def _backward(
     rows : (n,) array of ODOMETRY
         Filled from its end.
     """
-    count = 0
+    count, loss = 0, 0.0
     for i in range(len(records) - 1, -1, -1):
         record = records[i]
         earlier = records[i - 1].t if i > 0 else before
@@ -243,39 +310,26 @@ def _backward(
             adjoint[:] = 0.0
             information[:, :] = 0.0
         else:
-            _through_update(record, adjoint, information)
+            loss += _through_update(record, adjoint, information)
             _through_prediction(record.transition, adjoint, information)
-    return count
+    return count, loss
 
 
 @compiled
 def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row: Record) -> None:
     """Write the smoothed state x - P lambda and covariance P - P Lambda P to a row of ODOMETRY."""
     P = record.P
-    correction = np.zeros(ERROR_STATES)  # -P lambda
-    product = np.zeros((9, ERROR_STATES))  # upper rows of P Lambda
-    for j in range(ERROR_STATES):
-        for k in range(ERROR_STATES):
-            correction[j] -= P[j, k] * adjoint[k]
     row.t = record.t
     row.rate[:], row.rate_variance[:] = np.nan, np.nan
     row.x[:] = record.x
-    inject(row.x, correction, 1.0)
-    for i in range(9):
-        for k in range(ERROR_STATES):
-            for j in range(ERROR_STATES):
-                product[i, j] += P[i, k] * information[k, j]
-    for i in range(9):
-        for j in range(i, 9):
-            reduction = 0.0
-            for k in range(ERROR_STATES):
-                reduction += product[i, k] * P[k, j]
-            row.covariance[i, j] = row.covariance[j, i] = P[i, j] - reduction
+    inject(row.x, -np.dot(P, adjoint), 1.0)
+    covariance = P - np.dot(np.dot(P, information), P)
+    row.covariance[:] = 0.5 * (covariance + covariance.T)[:9, :9]
 
 
 @compiled
-def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """Step `adjoint` and `information` backwards through one scalar update.
+def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> float:
+    """Step `adjoint` and `information` backwards through one scalar update, and return its loss.
 
     The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S with C = I -
     K h. In the code:
@@ -283,26 +337,21 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
     - lambda, Lambda: adjoint, information
     - h, K: record.jacobian, record.gain
     - y, S: record.innovation and its record.variance
+
+    The residual of the measurement to the estimate by all others is u / M, its variance 1 / M, with u =
+    K' lambda + y / S and M = K' Lambda K + 1 / S (P. de Jong, A cross-validation filter for time series
+    models, Biometrika 75, 1988). The loss is half of u^2 / M - log M.
     """
     h, gain = record.jacobian, record.gain
-    information_gain = np.zeros(ERROR_STATES)  # Lambda K
-    for j in range(ERROR_STATES):
-        for k in range(ERROR_STATES):
-            information_gain[j] += information[j, k] * gain[k]
+    information_gain = np.dot(information, gain)  # Lambda K
     # factors of h' and of h' h: K' lambda + y / S, and K' Lambda K + 1 / S
-    adjoint_factor = record.innovation / record.variance
-    information_factor = 1.0 / record.variance
-    for k in range(ERROR_STATES):
-        adjoint_factor += gain[k] * adjoint[k]
-        information_factor += gain[k] * information_gain[k]
-    for j in range(ERROR_STATES):
-        adjoint[j] -= h[j] * adjoint_factor
-        for k in range(ERROR_STATES):
-            information[j, k] += (
-                h[j] * h[k] * information_factor
-                - h[j] * information_gain[k]
-                - information_gain[j] * h[k]
-            )
+    adjoint_factor = record.innovation / record.variance + np.dot(gain, adjoint)
+    information_factor = 1.0 / record.variance + np.dot(gain, information_gain)
+    cross = np.outer(h, information_gain)
+    adjoint -= adjoint_factor * h
+    information += information_factor * np.outer(h, h) - cross - cross.T
+    nis = min(adjoint_factor**2 / information_factor, LARGEST_NIS)
+    return 0.5 * (nis - math.log(information_factor))
 
 
 @compiled
@@ -314,21 +363,10 @@ def _through_prediction(
     The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. `transition` holds the upper
     rows of Phi; the lower rows equal the identity.
     """
-    before = adjoint.copy()
-    product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi
-    for i in range(ERROR_STATES):
-        product[i, MOVING_STATES:] = information[i, MOVING_STATES:]
-        for k in range(MOVING_STATES):
-            for j in range(ERROR_STATES):
-                product[i, j] += information[i, k] * transition[k, j]
-    adjoint[:MOVING_STATES] = 0.0
-    information[:MOVING_STATES] = 0.0
-    information[MOVING_STATES:] = product[MOVING_STATES:]
-    for k in range(MOVING_STATES):
-        for i in range(ERROR_STATES):
-            adjoint[i] += transition[k, i] * before[k]
-            for j in range(ERROR_STATES):
-                information[i, j] += transition[k, i] * product[k, j]
+    Phi = np.eye(ERROR_STATES)
+    Phi[:MOVING_STATES] = transition
+    adjoint[:] = np.dot(Phi.T, adjoint)
+    information[:] = np.dot(np.dot(Phi.T, information), Phi)
 
 
 # names of streams: TDOAs, which are not in SENSORS, and ranges

@@ -546,9 +546,13 @@ def _update(
             _reject(residual, innovation)
             return True
         innovation.noise_variance /= in_time
-    if tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known):
-        _reject(residual, innovation)
-        return False
+    if tdoa.t < ekf.rival_until:
+        # Wheels outweigh TDOAs that agree on another place for a while. Even with small robust
+        # weights, many such TDOAs would pull the position.
+        _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
+        if abs(innovation.value) > INLIER:
+            _reject(residual, innovation)
+            return False
     inflation = noise.variance_inflation(ekf, parameters, tdoa.t)
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -588,24 +592,14 @@ def _reject(residual: Record, innovation: Record) -> None:
 
 
 @compiled
-def _is_of_rival(ekf: Record, a: Record, b: Record, tdoa: Record, known: float) -> bool:
-    """Return whether a TDOA contradicts the position of a filter that follows wheels.
-
-    Wheels outweigh TDOAs that agree on another place for a while. Even with small robust weights,
-    many such TDOAs would pull the position.
-    """
-    _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, ekf.innovation)
-    return abs(ekf.innovation.value) > INLIER
-
-
-@compiled
 def _compare(
     hypothesis: Record, a: Record, b: Record, tdoa: Record, known: float, innovation: Record
 ) -> None:
     """Fill in the innovation of a TDOA for a HYPOTHESIS.
 
     The Jacobian contains the position, and the slope of the bias. The slope counts only within
-    LINEAR_RANGE of the state at which the bias was computed.
+    LINEAR_RANGE of the state at which the bias was computed. A TDOA with a smoothed position is
+    linearized there.
 
     Parameters
     ----------
@@ -620,9 +614,16 @@ def _compare(
     innovation : INNOVATION
         Filled by this function.
     """
-    predicted = linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
-    innovation.value = tdoa.d - known - predicted
-    innovation.entries = 3
+    if tdoa.smoothed:
+        predicted = linearized_tdoa(tdoa.position, a.position, b.position, innovation.row)
+        predicted += np.sum(innovation.row[:3] * (hypothesis.x[:3] - tdoa.position))
+        innovation.curvature = 0.0
+    else:
+        predicted = linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+        innovation.curvature = update.second_order_variance(
+            hypothesis.x, hypothesis.P, a.position, b.position
+        )
+    innovation.value, innovation.entries = tdoa.d - known - predicted, 3
     for k in range(N_STATES):
         innovation.states[k] = k
         if k >= 3:
@@ -633,9 +634,6 @@ def _compare(
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)
-    innovation.curvature = update.second_order_variance(
-        hypothesis.x, hypothesis.P, a.position, b.position
-    )
     innovation.prior_variance += innovation.curvature
 
 
@@ -737,14 +735,17 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
         best.P,
         noise.persisting_share(ekf, parameters),
         parameters.fixed_height_std,
+        ekf.workspace,
         row.consider_covariance,
     )
     row.covariance[:3, :3] += row.consider_covariance
+    squared = 0.0  # m^2, squared distance to where else the tag may be
     if t < ekf.rival_until:
-        _widen(ekf, best.x, row.covariance)
+        squared += np.sum((ekf.rival - best.x[:3]) ** 2)
     if ekf.consistency < INCONSISTENT:
-        for k in range(3):
-            row.covariance[k, k] += initialization.reach(ekf, t) ** 2
+        squared += initialization.reach(ekf, t) ** 2
+    for k in range(3):
+        row.covariance[k, k] += squared
     _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)
@@ -764,17 +765,6 @@ def _report_rate(ekf: Record, parameters: Record, t: float, row: Record) -> None
         row.rate_variance[:] = parameters.gyro_noise**2 / ekf.imu.period
     elif t - ekf.velocity.agreed <= velocity.HELD:
         row.rate[2], row.rate_variance[2] = ekf.velocity.yaw_rate, ekf.velocity.yaw_rate_variance
-
-
-@compiled
-def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add to a covariance the squared distance to the rival place that TDOAs agree on.
-
-    x is the position (3,) in m, world frame. covariance is (9, 9), updated in place.
-    """
-    square = np.sum((ekf.rival - x[:3]) ** 2)
-    for k in range(3):
-        covariance[k, k] += square
 
 
 def feed(

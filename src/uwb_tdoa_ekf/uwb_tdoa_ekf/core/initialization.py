@@ -311,7 +311,10 @@ def relocate(
     history : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
+    if (
+        not (parameters.recover and is_unsure(ekf))
+        or len(recent(ekf, parameters.start_window)) >= MINIMUM
+    ):
         return
     best, places = ekf.hypotheses[ekf.best], room_for(2)
     share = _search(ekf, anchors, parameters, t, _last(ekf, t)[0], places)
@@ -421,8 +424,15 @@ def set_pose(
         yaw, yaw_std = parameters.initial_yaw, parameters.initial_yaw_std
         if has_yaw:
             yaw, yaw_std = pose.yaw, pose.yaw_std
-        places = Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1))
-        _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
+        _begin(
+            ekf,
+            parameters,
+            t,
+            Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)),
+            yaw,
+            yaw_std,
+            parameters.use_imu,
+        )
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -684,8 +694,15 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
     """
     best = ekf.hypotheses[ekf.best]
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    place = Places(x, covariance, np.zeros(1))
-    _begin(ekf, parameters, ekf.t, place, yaw_of(best.x), yaw_std, True)
+    _begin(
+        ekf,
+        parameters,
+        ekf.t,
+        Places(x, covariance, np.zeros(1)),
+        yaw_of(best.x),
+        yaw_std,
+        True,
+    )
     ekf.attitude_reset = True
     add_reset(ekf, ekf.t, history)
 

@@ -63,6 +63,8 @@ TDOA = _record(
     ("slope", float, N_STATES),
     ("state", float, N_STATES),  # linearization point of the bias, m and m/s
     ("pose", float, 3),  # on the path of wheels, m and rad, see velocity.py; the filter sets it
+    ("smoothed", bool),  # the TDOA is linearized at a position of a smoothed path
+    ("position", float, 3),  # m, world frame, this position
 )
 # Measurement of a sensor, see sensors.py.
 SENSOR_ROW = _record(

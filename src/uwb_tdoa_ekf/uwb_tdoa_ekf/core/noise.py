@@ -234,6 +234,7 @@ def fill(
     P: np.ndarray,
     share: float,
     height_std: float,
+    bounds: np.ndarray,
     covariance: np.ndarray,
 ) -> None:
     """Compute the covariance of the position caused by persisting errors (consider covariance).
@@ -251,13 +252,17 @@ def fill(
         Share of the variance of a TDOA that persists, from `persisting_share`.
     height_std : float
         Standard deviation of a held height, m; 0 if no height is held.
+    bounds : (2, 3) array
+        Workspace, m, world frame: the prior where anchors tell little.
     covariance : (3, 3) array
         Consider covariance, m^2. Filled.
     """
     covariance[:, :] = 0.0
     if share == 0.0:
         return
-    total = information / share + inverse(P[:3, :3]) / MOST
+    total = (
+        information / share + inverse(P[:3, :3]) / MOST + np.diag((bounds[1] - bounds[0]) ** -2.0)
+    )
     if height_std > 0.0:
         total[2, 2] += 1.0 / height_std**2
     of_total = inverse(total)

@@ -270,7 +270,11 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
 
     The prior has heavy tails beside the anchors: its standard deviation is STD plus the distance of
     the tag from the workspace. Above and below them it is STD, because late arrivals near the floor
-    are often explained best by a place far above. It applies only while the standard deviation of the axis is larger. A prior that is
+    are often explained best by a place far above. For a tag inside, it is the width of the workspace.
+    TDOAs of anchors in a plane do not show how far a tag in this plane is from it. Without a bound
+    this variance grows until no TDOA counts, because all are nonlinear over such a distance.
+
+    The prior applies only while the standard deviation of the axis is larger. A prior that is
     given once must not shrink the covariance again and again. A tag that TDOAs place outside, by more
     than they leave open, is outside.
 
@@ -293,7 +297,9 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
     x = hypothesis.x[axis]
     nearest = min(max(x, bounds[0, axis]), bounds[1, axis])
     std = STD + (abs(x - nearest) if axis < 2 else 0.0)
-    if x == nearest or hypothesis.P[axis, axis] <= std**2:
+    if x == nearest:
+        nearest, std = 0.5 * (bounds[0, axis] + bounds[1, axis]), bounds[1, axis] - bounds[0, axis]
+    if hypothesis.P[axis, axis] <= std**2:
         return False
     kalman_direct(hypothesis, innovation, axis, nearest, std)
     return True
