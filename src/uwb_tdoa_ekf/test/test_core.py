@@ -494,6 +494,19 @@ def test_rest_is_not_believed_at_once_nor_after_a_gap():
     assert not is_quiet(after(**STILL, imu=imu, pause=1.0, seconds=0.3))
 
 
+def test_a_rate_beyond_the_range_of_the_gyroscope_is_noisy():
+    """The limit is repeated; a fast turn that goes on rising, or a slow constant one, is not."""
+    imu, rates = fresh(), [1.0, 1.0, 4.0, 5.0, 6.0, 6.0, 6.0, 4.0]
+    noisy = []
+    for k, rate in enumerate(rates):
+        sample = sample_of(0.002 * k, (0.0, 0.0, -rate), UP)
+        observe(imu, sample, 0.1)
+        store(imu, sample)
+        noisy.append(imu.gyro_psd[2] > 0.0)
+        assert imu.gyro_psd[0] == 0.0
+    assert noisy == [False, False, False, False, False, True, True, False]
+
+
 def test_the_more_an_axis_rectifies_the_less_it_weighs_and_the_noisier_it_is():
     vibration = np.array([0.0, 0.5, 5.0])
     imu = after((np.zeros(3), 0.0), (UP + vibration, vibration))

@@ -37,6 +37,9 @@ SHAKING_MEMORY = 2.0
 LEAST_RECTIFIED = 0.1  # least share of the vibration power that counts as rectified
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 PERIOD_SAMPLES = 10  # samples over which their period is averaged
+# A rate above FAST that repeats the largest one so far is clipped. The true one is larger by about
+# BEYOND of it, for about CLIPPED_FOR s at once.
+FAST, BEYOND, CLIPPED_FOR = 2.0, 0.6, 0.1
 
 SENSORS = ("gyro", "accel")
 # covariates with a smaller index are the position
@@ -90,6 +93,10 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
         # without vibration the share is undefined: 1, the worst, until the axis has vibrated
         share = power / max(power, imu.vibration[k]) if shakes else 1.0
         imu.rectified[k] = low_pass(imu.rectified[k], share, dt, SHAKING_MEMORY)
+        size, limit = abs(sample.gyro[k]), imu.gyro_limit[k]
+        clipped = size > FAST and size == limit and abs(imu.gyro[k]) == limit
+        imu.gyro_psd[k] = CLIPPED_FOR * (BEYOND * limit) ** 2 if clipped else 0.0
+        imu.gyro_limit[k] = max(size, limit)
         imu.gyro[k], imu.accel[k] = (
             0.5 * (imu.gyro[k] + sample.gyro[k]),
             0.5 * (imu.accel[k] + sample.accel[k]),

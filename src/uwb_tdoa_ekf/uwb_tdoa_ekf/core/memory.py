@@ -94,6 +94,8 @@ IMU_STATE = _record(
     # 0 to 1: recent power of the mean beyond hovering, relative to the vibration
     ("rectified", float, 3),
     ("gyro_power", float, 3),  # rad^2/s^2
+    ("gyro_limit", float, 3),  # rad/s, largest size so far
+    ("gyro_psd", float, 3),  # (rad/s)^2/Hz, of rates beyond the range
     ("accel_weight", float, 3),  # 0 to 1, of the measurement against hovering, see inertial.weigh
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the remaining noise
 )

@@ -131,7 +131,7 @@ def predict(
         for i in range(6 + r + 1):
             by_rotation = e0 * T[i, 6] + e1 * T[i, 7] + e2 * T[i, 8]
             P[i, 6 + r] = P[6 + r, i] = by_rotation - dt * T[i, 12 + r]
-    _add_noise(P, transition.rotation, imu.accel_psd, parameters, dt)
+    _add_noise(P, transition.rotation, imu, parameters, dt)
 
 
 @compiled
@@ -207,14 +207,13 @@ def propagate_vector(vector: np.ndarray, transition: Record) -> None:
 
 
 @compiled
-def _add_noise(
-    P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float
-) -> None:
+def _add_noise(P: np.ndarray, R: np.ndarray, imu: Record, parameters: Record, dt: float) -> None:
     """Add the process noise over dt (s) to the covariance P (15, 15).
 
     It consists of the white noise of the sensors and the random walks of their biases. R (3, 3) is
-    body to world. accel_psd is (3,), (m/s^2)^2/Hz, body frame.
+    body to world. imu is an IMU_STATE, whose noise is in the body frame.
     """
+    accel_psd = imu.accel_psd
     s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
     for r in range(3):
         for c in range(r, 3):
@@ -222,7 +221,7 @@ def _add_noise(
                 R[r, 0] * s0 * R[c, 0] + R[r, 1] * s1 * R[c, 1] + R[r, 2] * s2 * R[c, 2]
             )
             P[3 + c, 3 + r] = P[3 + r, 3 + c]
-        P[6 + r, 6 + r] += dt * parameters.gyro_noise**2
+        P[6 + r, 6 + r] += dt * (parameters.gyro_noise**2 + imu.gyro_psd[r])
         P[9 + r, 9 + r] += dt * parameters.accel_bias_walk**2
         P[12 + r, 12 + r] += dt * parameters.gyro_bias_walk**2
 
