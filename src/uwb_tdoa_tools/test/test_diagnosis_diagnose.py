@@ -9,6 +9,7 @@ import json
 from types import SimpleNamespace
 
 from known_effects import clean_flight, effect_of, sparse_flight
+import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
@@ -460,3 +461,23 @@ def test_diagnose_offers_it_beside_physics_and_judges_both():
         output.as_json(result)["numbers"]
     )
     assert repairing.repaired(flights[:1], result.effects) == {}
+
+
+@pytest.mark.slow
+def test_pulses_of_any_phase_are_taken_out_of_each_flight():
+    """They recur in 9.2 s, and hide what flights share; a flight without them stays as it is."""
+    clean = [replace(clean_flight(seed, 40.0), name=f"flight-{seed}") for seed in (31, 32)]
+    recorded = []
+    for flight, begin in zip(clean, (1.0, 5.5)):
+        for anchor in ("1", "4"):
+            knots = (begin, begin + 2.9, begin + 9.2)
+            late = {f"{anchor}.c1": 0.5}
+            pulse = SmoothTerm(late, covariate="time", form="anchor", knots=knots, shape="pulse")
+            flight = pulse.inject(flight)
+        recorded.append(flight)
+    found, pulses = repairing.without_pulses([*recorded, clean[0]], GroundTruth(), EffectSet())
+    assert [name for name, _ in pulses] == ["flight-31", "flight-32"]
+    for before, after, right in zip(recorded, found, clean):
+        errors = [np.mean(np.abs(one.tdoa.d - right.tdoa.d)) for one in (before, after)]
+        assert errors[1] < 0.25 * errors[0]
+    assert found[2] is clean[0]

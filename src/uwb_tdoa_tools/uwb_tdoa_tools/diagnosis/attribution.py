@@ -310,6 +310,13 @@ class EffectSearch:
             floor_names=tuple(name for name, _ in near),
         )
 
+    def pulses(self) -> Selection:
+        """Return the pulses that recur in these residuals, beside all other effects of one step."""
+        scan = self._scan_of(self._unmoved)
+        found = select(self._unmoved, self.declared, self.inflation, self.search, scan)
+        found = cross_validated(found, [])
+        return found.kept([one for one in found.chosen if _is_pulse(one)])
+
     @property
     def search(self) -> Search:
         """Return the search of the detectors."""
@@ -551,6 +558,11 @@ def _smooth(
         for term in channel.smooth_terms(parts) if parts else ():
             out += candidates_of(term, *installation)[:1]
     return out
+
+
+def _is_pulse(candidate: Candidate) -> bool:
+    functions = [term.function for term in candidate.terms]
+    return all(one is not None and one.shape == "pulse" for one in functions)
 
 
 def _is_large(candidate: Candidate, selection: Selection) -> bool:

@@ -108,7 +108,14 @@ def diagnose(
     )
     sound, rest = repairing.sound(fitted, base, repairs)
     if reference.tells_errors:
-        found, selected = _with_functions_of_axes(work, sound, rest, *_searched(work, sound, rest))
+        steady, pulses = sound, ()
+        if count > 1:
+            looking = work.saying("looking for pulses of each flight")
+            steady, pulses = repairing.without_pulses(sound, reference, rest, config, looking)
+        found, selected = _with_functions_of_axes(
+            work, steady, rest, *_searched(work, steady, rest)
+        )
+        found = replace(found, alone=(*pulses, *found.alone))
         outcome = _by_error(work, found, selected, fitted, held_out, repairs)
     else:
         search = work.search(sound, rest)

@@ -14,9 +14,12 @@ from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..checking.pair_rules import KnownPath, repairs
-from .attribution import Attribution
+from .attribution import Attribution, EffectSearch
 from .comparison import Baseline, ValidationCase, score
 from .detectors import Detection
+from .references import Reference
+from .refinement import effects_of
+from .regression.select import Selection
 from .regression.terms import Candidate
 from .validation import TRIAL_FLIGHTS, WORSE, ValidatedSelection
 
@@ -56,6 +59,32 @@ def sound(
     rest = tuple(effect for effect in base.effects if not isinstance(effect, LabelEffect))
     corrected = tuple(map(undo.correct_streams, flights)) if len(undo) else tuple(flights)
     return corrected, replace(base, effects=rest)
+
+
+def without_pulses(
+    flights: Sequence[Flight],
+    reference: Reference,
+    base: EffectSet,
+    config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> tuple[tuple[Flight, ...], tuple[tuple[str, Selection], ...]]:
+    """Return Flights without their pulses, and ((name of a flight, Selection of its pulses), ...).
+
+    A pulse recurs with a phase of its own in each flight. Other flights do not have it, but it
+    hides what they have. It is taken out if that improves the filter in this flight.
+    """
+    out, found = [], []
+    for flight in flights:
+        search = EffectSearch([flight], reference, base, progress=progress)
+        selection, less = search.pulses(), flight
+        for effect in effects_of(selection):
+            values = {key: -value for key, value in effect.values.items()}
+            less = replace(effect, values=values).inject(less)
+        errors = [_error([one], base.effects, config, progress) for one in (flight, less)]
+        better = errors[1] < errors[0] * (1.0 - WORSE)
+        out.append(less if better else flight)
+        found += [(flight.name, selection)] if better else []
+    return tuple(out), tuple(found)
 
 
 def before_others(
