@@ -108,10 +108,8 @@ def diagnose(
     )
     sound, rest = repairing.sound(fitted, base, repairs)
     if reference.tells_errors:
-        steady, pulses = sound, ()
-        if count > 1:
-            looking = work.saying("looking for pulses of each flight")
-            steady, pulses = repairing.without_pulses(sound, reference, rest, config, looking)
+        pulsing = work.saying("looking for pulses of each flight")
+        steady, pulses = repairing.without_pulses(sound, reference, rest, config, pulsing)
         found, selected = _with_functions_of_axes(
             work, steady, rest, *_searched(work, steady, rest)
         )

@@ -71,8 +71,11 @@ def without_pulses(
     """Return Flights without their pulses, and ((name of a flight, Selection of its pulses), ...).
 
     A pulse recurs with a phase of its own in each flight. Other flights do not have it, but it
-    hides what they have. It is taken out if that improves the filter in this flight.
+    hides what they have. It is taken out if that improves the filter in this flight. A single
+    flight keeps its pulses.
     """
+    if len(flights) < 2:
+        return tuple(flights), ()
     out, found = [], []
     for flight in flights:
         search = EffectSearch([flight], reference, base, progress=progress)
