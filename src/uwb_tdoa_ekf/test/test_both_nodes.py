@@ -112,9 +112,11 @@ def test_status_says_what_may_be_flown_by_and_why_not(rig):
 
 def test_an_anchor_that_goes_one_that_moves_and_one_that_comes_do_not_stop_the_nodes(rig):
     flight, said = flight_through(), [len(process.lines) for process in rig.processes]
+    early = cut(flight, -np.inf, CHANGE)
+    received = rig.counts("ekf_node")["TDOAs received"] + len(early.tdoa)
     rig.send_anchors(BOX)
-    rig.play(cut(flight, -np.inf, CHANGE))
-    before = rig.counts("ekf_node", state="running")
+    rig.play(early)
+    before = rig.counts("ekf_node", state="running", TDOAs_received=received)
     rig.send_anchors(after())
 
     def told():
