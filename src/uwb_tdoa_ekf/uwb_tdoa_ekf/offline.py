@@ -39,7 +39,7 @@ from .core.memory import (
     structured,
     usable_tdoas,
 )
-from .core.sensors import STREAMS, STREAMS as SENSOR_NAMES
+from .core.sensors import STREAMS
 from .monitoring.monitor import Monitor
 from .monitoring.slices import LENGTH
 from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer
@@ -505,7 +505,7 @@ def loaded(
         rows, usable = imu_rows(flight.imu.t, flight.imu.gyro, flight.imu.accel)
         buffer.load(IMU_STREAM, rows[usable])
     felt, kept_of = [], {}
-    for name in SENSOR_NAMES:
+    for name in STREAMS:
         stream = getattr(flight, name)
         if stream is not None and getattr(config, f"use_{name}"):
             rows, usable = sensor_rows(name, stream, flight.anchors)
@@ -519,7 +519,7 @@ def loaded(
     together = together[np.lexsort((together["kind"], together["t"]))]
     buffer.load(FIRST_SENSOR, together)
     return buffer, {
-        name: (*kept, np.flatnonzero(together["kind"] == SENSOR_NAMES.index(name)))
+        name: (*kept, np.flatnonzero(together["kind"] == STREAMS.index(name)))
         for name, kept in kept_of.items()
     }
 

@@ -67,13 +67,14 @@ def alike(ekf: Record) -> bool:
 def set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
     """Set position and velocity x (6,) of a HYPOTHESIS and their covariance (6, 6).
 
-    They are then independent of attitude and biases, which stay the same.
+    They are then independent of attitude and biases, which stay the same. An inverse is symmetric up
+    to rounding; the covariance of a hypothesis is symmetric.
     """
     auxiliary.forget(hypothesis)
     hypothesis.x[:6] = x
     hypothesis.P[:6, :] = 0.0
     hypothesis.P[:, :6] = 0.0
-    hypothesis.P[:6, :6] = covariance
+    hypothesis.P[:6, :6] = 0.5 * (covariance + covariance.T)
 
 
 @compiled

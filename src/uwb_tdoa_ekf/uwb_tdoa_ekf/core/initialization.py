@@ -424,15 +424,8 @@ def set_pose(
         yaw, yaw_std = parameters.initial_yaw, parameters.initial_yaw_std
         if has_yaw:
             yaw, yaw_std = pose.yaw, pose.yaw_std
-        _begin(
-            ekf,
-            parameters,
-            t,
-            Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)),
-            yaw,
-            yaw_std,
-            parameters.use_imu,
-        )
+        places = Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1))
+        _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -694,15 +687,8 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
     """
     best = ekf.hypotheses[ekf.best]
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(
-        ekf,
-        parameters,
-        ekf.t,
-        Places(x, covariance, np.zeros(1)),
-        yaw_of(best.x),
-        yaw_std,
-        True,
-    )
+    place = Places(x, covariance, np.zeros(1))
+    _begin(ekf, parameters, ekf.t, place, yaw_of(best.x), yaw_std, True)
     ekf.attitude_reset = True
     add_reset(ekf, ekf.t, history)
 

@@ -153,7 +153,9 @@ def carry(state: Record, t: float, pose: np.ndarray) -> None:
     pose (3,) is x and y in m and the heading in rad, in the frame of the path.
     """
     vx, vy, rate = state.path_velocity[0], state.path_velocity[1], state.path_velocity[2]
-    dt = min(t - state.path_until, HELD)
+    dt = t - state.path_until
+    if dt > HELD:  # the path ends, and a new one does not use this pose
+        return
     heading = state.pose[2] + 0.5 * dt * rate
     c, s = math.cos(heading), math.sin(heading)
     pose[0] = state.pose[0] + dt * (c * vx - s * vy)

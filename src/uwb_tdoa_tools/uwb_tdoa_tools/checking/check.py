@@ -354,6 +354,8 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
             value=tdoa_rules.apparent_gain(fit),
         )
     if gain is None and poor:
+        late = fit.before - fit.late_loss > tdoa_rules.ALONE * gain
+        or_late = ", or several are late" if late else ""
         yield Finding(
             "survey_misfit",
             ERROR,
@@ -374,10 +376,7 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
         yield Finding(
             "survey_misfit",
             ERROR,
-            cause=(
-                "the survey does not fit: of another room, or anchors have been moved"
-                + ", or several are late" * (fit.before - fit.late_loss > tdoa_rules.ALONE * gain)
-            ),
+            cause=f"the survey does not fit: of another room, or anchors have been moved{or_late}",
             evidence=evidence,
             remedy=OTHER_SURVEY,
             value=gain,

@@ -299,8 +299,9 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
 
     The accelerometer is fixed, because the yaw is unknown anyway.
     """
-    short, losses = recording.part(BRIEF), list[float]()
+    short = recording.part(BRIEF)
     arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
+    losses: list[float] = []
     for accel, gyro in arrangements:
         least = sorted(losses)[CHOSEN - 1] if len(losses) >= CHOSEN else np.inf
         loss = _arranged(short, accel, gyro).recording.unexplained(least, LEANING).mean

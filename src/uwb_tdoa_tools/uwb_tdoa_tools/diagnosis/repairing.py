@@ -78,15 +78,17 @@ def without_pulses(
         return tuple(flights), ()
     out, found = [], []
     for flight in flights:
-        search = EffectSearch([flight], reference, base, progress=progress)
-        selection, less = search.pulses(), flight
+        selection = EffectSearch([flight], reference, base, progress=progress).pulses()
+        less = flight
         for effect in effects_of(selection):
             values = {key: -value for key, value in effect.values.items()}
             less = replace(effect, values=values).inject(less)
-        errors = [_error([one], base.effects, config, progress) for one in (flight, less)]
-        better = errors[1] < errors[0] * (1.0 - WORSE)
-        out.append(less if better else flight)
-        found += [(flight.name, selection)] if better else []
+        if selection.chosen:
+            errors = [_error([one], base.effects, config, progress) for one in (flight, less)]
+            if errors[1] < errors[0] * (1.0 - WORSE):
+                found.append((flight.name, selection))
+                flight = less
+        out.append(flight)
     return tuple(out), tuple(found)
 
 
