@@ -311,10 +311,16 @@ class EffectSearch:
         )
 
     def pulses(self) -> Selection:
-        """Return the pulses that recur in these residuals, beside all other effects of one step."""
-        scan = self._scan_of(self._unmoved)
-        found = select(self._unmoved, self.declared, self.inflation, self.search, scan)
-        found = cross_validated(found, [])
+        """Return the pulses that recur in these residuals, beside other effects.
+
+        Functions are searched only if a pulse is among the best beside declared effects.
+        """
+        table = self._unmoved
+        found = select(table, self.declared, self.inflation, self.search)
+        scan = self._scan_of(table)
+        if any(map(_is_pulse, scan(table, found.fit, found.chosen))):
+            found = select(table, self.declared, self.inflation, self.search, scan, found.chosen)
+            found = cross_validated(found, [])
         return found.kept([one for one in found.chosen if _is_pulse(one)])
 
     @property
