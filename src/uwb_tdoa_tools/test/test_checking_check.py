@@ -73,7 +73,7 @@ def found_by_rules(recording, others=(), of_imu=False):
     if of_imu:
         found = [imu_rules.find_imu_mistake(ordered)]
     else:
-        found = [tdoa_rules.best_trial(ordered, others)[0], *_misfit(ordered.survey_fit)]
+        found = [tdoa_rules.best_trial(ordered, others)[0], _misfit(ordered.survey_fit)]
     yield from filter(None, found)
 
 

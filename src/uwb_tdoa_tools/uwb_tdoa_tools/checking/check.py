@@ -285,10 +285,10 @@ def _try_corrections(
     fit = ordered.survey_fit
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
-        found += _misfit(fit)
+        found += filter(None, [_misfit(fit)])
     elif blamed and tdoa_rules.still_gains(fit):  # the corrections did not make it fit
         found = [finding for finding in found if finding not in blamed]
-        found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
+        found += filter(None, [_misfit(given.survey_fit) or _misfit(fit)])
     if (
         ordered.imu is not None
         and not names & WITHOUT_IMU
@@ -299,88 +299,63 @@ def _try_corrections(
     return found, fit.places
 
 
-def _misfit(fit: SurveyFit) -> Iterator[Finding]:
-    """Yield a finding if the survey fits much better with several of its anchors moved, or late."""
+def _misfit(fit: SurveyFit) -> Finding | None:
+    """Return the finding on a survey that fits much better with anchors moved, or late; or none."""
     if tdoa_rules.is_of_delays(fit):
-        yield Finding(
+        less = 100.0 * (1.0 - fit.late_loss / fit.before)
+        return Finding(
             "anchors_late",
             ERROR,
-            cause="several anchors are late or early: no anchor needs to stand elsewhere",
-            evidence=(
-                f"{100.0 * (1.0 - fit.late_loss / fit.before):.0f} % less stays unexplained with a "
-                "delay of each anchor"
-            ),
-            remedy="calibrate the delays: survey, or diagnose; look what stands before the anchors",
-            value=fit.late_loss,
+            "several anchors are late or early: no anchor needs to stand elsewhere",
+            f"{less:.0f} % less stays unexplained with a delay of each anchor",
+            "calibrate the delays: survey, or diagnose; look what stands before the anchors",
+            fit.late_loss,
         )
-        return
     gain = tdoa_rules.gained(fit)
+    if gain is not None:
+        moved = displacement(fit.positions[fit.heard], fit.all_moved[1][fit.heard])
+        or_late = ", or several are late" * (fit.before - fit.late_loss > tdoa_rules.ALONE * gain)
+        return Finding(
+            "survey_misfit",
+            ERROR,
+            f"the survey does not fit: of another room, or anchors have been moved{or_late}",
+            f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
+            f"by {np.median(moved):.1f} m in the median",
+            OTHER_SURVEY,
+            gain,
+        )
     enough = fit.seconds >= tdoa_rules.SHORTEST and len(fit.positions) <= MANY and not fit.flat
-    poor = enough and fit.before > tdoa_rules.POOR
-    unclear = gain is None and not poor and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN
-    if unclear and tdoa_rules.is_of_radio(fit):
+    if enough and fit.before > tdoa_rules.POOR:
+        return Finding(
+            "survey_misfit",
+            ERROR,
+            "the survey does not fit: of another room, or its ids are mixed up",
+            "wherever the tag is, and with any anchors moved, the TDOAs do not fit",
+            OTHER_SURVEY,
+            fit.before,
+        )
+    if tdoa_rules.apparent_gain(fit) <= tdoa_rules.GAIN:
+        return None
+    if tdoa_rules.is_of_radio(fit):
         more = 100.0 * (1.0 - fit.radio_loss / fit.all_moved[0])
-        yield Finding(
+        return Finding(
             "radio_errors",
             WARNING,
-            cause="the errors of the TDOAs depend on the place of the tag: no anchor is blamed",
-            evidence=(
-                "errors of each anchor that change with the place explain more than anchors "
-                f"elsewhere: {more:.0f} % less stays unexplained"
-            ),
-            remedy=(
-                "look what stands between tag and anchors: a body, metal, a wall; "
-                "localize --zones shows where"
-            ),
-            value=more,
+            "the errors of the TDOAs depend on the place of the tag: no anchor is blamed",
+            "errors of each anchor that change with the place explain more than anchors elsewhere: "
+            f"{more:.0f} % less stays unexplained",
+            "look what stands between tag and anchors: a body, metal, a wall; localize --zones "
+            "shows where",
+            more,
         )
-    elif unclear:
-        yield Finding(
-            "misfit_unclear",
-            NOTE,
-            cause=(
-                "the TDOAs fit the survey less well than usual, and this recording does not "
-                "determine "
-                "why"
-            ),
-            evidence=(
-                "with the anchors elsewhere each half of the recording fits better, and not the "
-                "other half"
-            ),
-            remedy=(
-                "record a minute in which the tag is carried through the whole room, and check "
-                "again"
-            ),
-            value=tdoa_rules.apparent_gain(fit),
-        )
-    if gain is None and poor:
-        late = fit.before - fit.late_loss > tdoa_rules.ALONE * gain
-        or_late = ", or several are late" if late else ""
-        yield Finding(
-            "survey_misfit",
-            ERROR,
-            cause="the survey does not fit: of another room, or its ids are mixed up",
-            evidence="wherever the tag is, and with any anchors moved, the TDOAs do not fit",
-            remedy=OTHER_SURVEY,
-            value=fit.before,
-        )
-    if gain is not None:
-        heard, (_, anchors) = fit.heard, fit.all_moved
-        evidence = (
-            f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
-        )
-        evidence += (
-            f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the "
-            "median"
-        )
-        yield Finding(
-            "survey_misfit",
-            ERROR,
-            cause=f"the survey does not fit: of another room, or anchors have been moved{or_late}",
-            evidence=evidence,
-            remedy=OTHER_SURVEY,
-            value=gain,
-        )
+    return Finding(
+        "misfit_unclear",
+        NOTE,
+        "the TDOAs fit the survey less well than usual, and this recording does not determine why",
+        "with the anchors elsewhere each half of the recording fits better, and not the other half",
+        "record a minute in which the tag is carried through the whole room, and check again",
+        tdoa_rules.apparent_gain(fit),
+    )
 
 
 def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:

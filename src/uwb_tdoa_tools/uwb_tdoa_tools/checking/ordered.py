@@ -15,6 +15,7 @@ import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
@@ -329,14 +330,10 @@ def differences(ranges: Ranges, anchors: Anchors) -> Tdoas:
 
 
 def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """Return how far each anchor moved, (N,) m, after the best common rotation and translation.
-
-    Source: Kabsch, Acta Cryst. A 32, 1976.
-    """
+    """Return how far each anchor moved, (N,) m, after the best common rotation and translation."""
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
-    U, _, Vt = np.linalg.svd(two.T @ one)
-    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return np.linalg.norm(two @ turn - one, axis=1)
+    turn, _ = Rotation.align_vectors(one, two)
+    return np.linalg.norm(turn.apply(two) - one, axis=1)
 
 
 def size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
