@@ -66,6 +66,9 @@ AS_RADIO = 0.9
 # nothing else is wrong, and 0.75 to 0.91 (measured); the survey of another day 0.90 at most
 AS_LATE = 0.93
 ALONE = 0.85  # share of the gain that one anchor explains, or delays do
+# the same of the gain with a delay of each anchor: one moved anchor 0.92 at least where ALONE holds;
+# two or three late ones 0.90 at most (one of 29: 0.98)
+BESIDE_DELAYS = 0.91
 # windows with a position; TDOAs of an anchor that may have the id of another; successive TDOAs
 FEWEST = 10
 APART = 1.0  # m, least error of such an anchor: anchors of a hall are farther from each other
@@ -304,7 +307,7 @@ def moved_anchor(recording: OrderedRecording) -> Iterator[Trial]:
     solved = {row: fit.solve([row]) for row in tried}  # (loss, positions) with this anchor moved
     row = min(solved, key=lambda row: solved[row][0])
     loss, positions = solved[row]
-    if (fit.before - loss) / gain < ALONE or fit.late_loss < AS_RADIO * loss:
+    if fit.before - loss < max(ALONE * gain, BESIDE_DELAYS * (fit.before - fit.late_loss)):
         return
     number = int(recording.anchors.ids[row])
     shift = ", ".join(f"{s:+.1f}" for s in positions[row] - fit.positions[row])
