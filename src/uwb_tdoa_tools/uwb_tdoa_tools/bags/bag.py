@@ -29,7 +29,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError, printable, written_by
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS, Stream
@@ -48,13 +48,12 @@ from .topics import (
     TF_STATIC,
     Names,
     imu_in_body,
-    on_one_clock,
     other_namespaces,
-    read_frames,
-    read_stream,
+    read_streams,
     read_topic,
     recorded_anchors,
     sensor_place,
+    surveyed,
     topics_of,
 )
 
@@ -133,8 +132,9 @@ def write_bag(
         kind, frame = STREAMS[name], frame_of.get(name, bag_messages.BODY_FRAME)
         topics[f"/{kind.topic}"] = kind.message, STREAM_QOS, kind.messages(stream, frame, store)
 
+    about = {"name": flight.name, "meta": flight.meta, "written_by": written_by()}
     with new_bag(out, storage, force) as writer:
-        writer.set_custom_data(_FLIGHT_KEY, _about_flight(flight))
+        writer.set_custom_data(_FLIGHT_KEY, json.dumps(about, default=str))
         return _write(writer, topics, store)
 
 
@@ -198,12 +198,6 @@ def _serialized(
         yield stamp, connection, store.serialize_cdr(message, connection.msgtype)
 
 
-def _about_flight(flight: Flight) -> str:
-    return json.dumps(
-        {"name": flight.name, "meta": flight.meta, "written_by": written_by()}, default=str
-    )
-
-
 def read_bag(
     path: str | Path,
     namespace: str = "",
@@ -231,52 +225,33 @@ def read_bag(
     A bag is read up to where it is cut, see `meta["remarks"]`. Raises InputError without uwb/tdoa,
     without any anchors, and for numbers that are not finite.
     """
+    name_of, streams = Names(namespace, topics), dict[str, Any]()
+    of_anchors = name_of("uwb/anchors")
     with open_bag(path) as reader:
         about = _about(path, reader.custom)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of = list[str](), Names(namespace, topics)
-        tree = read_frames(path, reader, name_of)
-        found = {
-            name: read_stream(path, reader, name, name_of, tree)
-            for name in STREAMS
-            if truth or name != "pose"
-        }
-        remarks += [remark for of in found.values() for remark in of.remarks]
-        found, clock = on_one_clock(found)
-        if clock.jumps or clock.kept:
-            meta["clock"] = clock.jumps, clock.outliers
-            remarks += sentences(clock)
-
-        def stream(name: str) -> Any:
-            if name not in found:
-                return None
-            topic, make, valid = STREAMS[name].topic, STREAMS[name].make, STREAMS[name].valid
-            stamps, rows, falls = found[name].in_order()
+        names = [name for name in STREAMS if truth or name != "pose"]
+        bag = read_streams(path, reader, name_of, names)
+        if bag.clock.jumps or bag.clock.kept:
+            meta["clock"] = bag.clock.jumps, bag.clock.outliers
+        remarks = [remark for of in bag.found.values() for remark in of.remarks]
+        remarks += sentences(bag.clock)
+        for name in names:
+            kind = STREAMS[name]
+            stamps, rows, falls = bag.found[name].in_order()
             if falls:
-                meta.setdefault("reordered", {})[topic] = falls
-            if not len(stamps):
-                return None
-            whole = valid(rows).all(axis=1)
+                meta.setdefault("reordered", {})[kind.topic] = falls
+            whole = kind.valid(rows).all(axis=1) if len(rows) else np.zeros(0, bool)
             if not whole.all():
                 if not salvage:
-                    raise _not_finite(
-                        path,
-                        " and ".join(name_of(each) for each, _ in topics_of(name)),
-                        stamps,
-                        rows,
-                        valid,
-                    )
-                remarks.append(
-                    f"{topic}: {np.count_nonzero(~whole)} messages left out, they are no numbers."
-                )
-                stamps, rows = stamps[whole], rows[whole]
-            return make(stamps, rows) if len(stamps) else None
-
-        tdoa = stream("tdoa")
-        sensors: dict[str, Any] = {name: stream(name) for name in SENSORS}
-        if tdoa is None and any(sensors[name] is not None for name in LOCATING):
-            tdoa = bag_messages.tdoas_of(np.empty(0), np.empty((0, 4)))
-        if tdoa is None:
+                    listed = " and ".join(name_of(topic) for topic, _ in topics_of(name))
+                    raise _not_finite(path, listed, stamps, rows, kind.valid)
+                left_out = np.count_nonzero(~whole)
+                remarks.append(f"{kind.topic}: {left_out} messages left out, they are no numbers.")
+            if whole.any():
+                streams[name] = kind.make(stamps[whole], rows[whole])
+        radio = [name for name in ("tdoa", *LOCATING) if name in streams]
+        if not radio:
             count = reader.unreadable[name_of("uwb/tdoa")]
             why = (
                 f"{count} that are there cannot be read"
@@ -285,36 +260,24 @@ def read_bag(
             )
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
-            recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
-            if recorded is None:
-                raise InputError(
-                    f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file "
-                    "(--survey FILE)."
-                )
-            anchors = refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
-            remarks += recorded.remarks(name_of("uwb/anchors"))
-        imu = stream("imu")
+            recorded = surveyed(path, recorded_anchors(path, reader, of_anchors), of_anchors)
+            anchors = recorded.anchors
+            remarks += recorded.remarks(of_anchors)
         # the antenna is that of the TDOAs, or of ranges without any
-        radio = ["tdoa"] if len(tdoa) else [name for name in LOCATING if sensors[name] is not None]
-        places = {
-            name: sensor_place(tree, STREAMS[name].topic, found[name].frames)
-            for name in ("imu", *radio)
-        }
-        remarks += [remark for _, remark in places.values() if remark]
-        remarks = [*remarks_of(reader), *remarks]
-        unread = _unread(reader, name_of)
-        poses = stream("pose")
-    if imu is not None and (place := places["imu"][0]):
-        imu = imu_in_body(imu, place)
-    for name in radio:
-        antenna, _ = places[name]
-        if antenna is not None:
-            meta["antenna"] = antenna[1].tolist()
-    if remarks:
-        meta["remarks"] = remarks
-    if unread:
-        meta["unread"] = unread
-    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, clock.restarts, **sensors)
+        for name in ("imu", *(["tdoa"] if "tdoa" in streams else radio)):
+            place, remark = sensor_place(bag.frames, STREAMS[name].topic, bag.found[name].frames)
+            remarks += [remark] if remark else []
+            if place and name != "imu":
+                meta["antenna"] = place[1].tolist()
+            elif place and name in streams:
+                streams[name] = imu_in_body(streams[name], place)
+        if remarks := [*remarks_of(reader), *remarks]:
+            meta["remarks"] = remarks
+        if unread := _unread(reader, name_of):
+            meta["unread"] = unread
+    streams.setdefault("tdoa", bag_messages.tdoas_of(np.empty(0), np.empty((0, 4))))
+    streams["truth"] = streams.pop("pose", None)
+    return Flight(about["name"], anchors, meta=meta, restarts=bag.clock.restarts, **streams)
 
 
 def _unread(reader: BagReader, name_of: Names) -> list[str]:
@@ -428,12 +391,17 @@ Timed = Tdoas | Imu | Truth | Stream
 CONVERTED = *choices.STREAMS, *SENSOR_NAMES
 
 
-@dataclass(frozen=True)
-class Converted:
-    """Summary of a conversion.
+def convert(
+    read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False
+) -> dict[str, Any]:
+    """Write a recording as a bag, see `write_bag`, and return a summary.
 
-    Attributes
+    Parameters
     ----------
+    read : returns the Flight.
+
+    Returns
+    -------
     flight, bag : name of the flight, path of the bag.
     messages : {topic: count}.
     read : {stream: (samples, s of the first, s of the last)}.
@@ -443,75 +411,56 @@ class Converted:
     left_out : {stream without a place in a bag: events}.
     meta : of the Flight.
     apart : sentences on sensors without common time with TDOAs or ranges.
-    """
-
-    flight: str
-    bag: str
-    messages: dict[str, int]
-    read: dict[str, tuple[int, float, float]]
-    start: float
-    end: float
-    anchors: int
-    tdoa_unknown_anchor: int
-    left_out: dict[str, int]
-    meta: dict[str, Any]
-    apart: list[str]
-
-
-def convert(
-    read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False
-) -> Converted:
-    """Write a recording as a bag, see `write_bag`; `read` returns the Flight.
 
     Raises InputError.
     """
     check_output(out, force)  # before the work, not after it
     flight = _from_zero_on(read())
-    counts = write_bag(flight, out, storage, force)
-    together = [
-        stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight)
-    ]
+    counts, held = write_bag(flight, out, storage, force), _held(flight)
+    together = [stream for stream in held.values() if _overlaps(stream, flight)]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)
     ranges_known = (
         np.ones(0, bool) if flight.range is None else flight.anchors.index(flight.range.anchor) >= 0
     )
-    return Converted(
-        flight=flight.name,
-        bag=str(out),
-        messages=counts,
-        read={
-            name: (len(t), float(t[0]), float(t[-1]))
-            for name in _held(flight)
-            for t in [getattr(flight, name).t]
-        },
-        start=min(float(stream.t[0]) for stream in together),
-        end=max(float(stream.t[-1]) for stream in together),
-        anchors=len(flight.anchors),
-        tdoa_unknown_anchor=int(np.count_nonzero(~known) + np.count_nonzero(~ranges_known)),
-        left_out={name: len(columns["t"]) for name, columns in flight.extra.items()},
-        meta=flight.meta,
-        apart=_disjoint_sensors(flight),
-    )
+    return {
+        "flight": flight.name,
+        "bag": str(out),
+        "messages": counts,
+        "read": {name: (len(of.t), float(of.t[0]), float(of.t[-1])) for name, of in held.items()},
+        "start": min(float(stream.t[0]) for stream in together),
+        "end": max(float(stream.t[-1]) for stream in together),
+        "anchors": len(flight.anchors),
+        "tdoa_unknown_anchor": int(np.count_nonzero(~known) + np.count_nonzero(~ranges_known)),
+        "left_out": {name: len(columns["t"]) for name, columns in flight.extra.items()},
+        "meta": flight.meta,
+        "apart": _disjoint_sensors(flight),
+    }
 
 
-def described(converted: Converted) -> list[str]:
-    """Return a conversion as lines: what was read and written, with counts, and what was left out."""
-    meta, seconds = converted.meta, converted.end - converted.start
-    out = [f"{converted.flight}: {seconds:.1f} s, {meta.get('protocol', 'protocol unknown')}"]
+def described(made: dict[str, Any]) -> list[str]:
+    """Return the summary of `convert` as lines: what was read and written, with counts, and what was left out."""
+    meta, seconds = made["meta"], made["end"] - made["start"]
+    out = [f"{made['flight']}: {seconds:.1f} s, {meta.get('protocol', 'protocol unknown')}"]
     if ids := meta.get("anchor_ids"):
         listed = ", ".join(f"{name} is {number}" for name, number in ids.items())
         out.append(f"  ids in the bag: {listed}")
     out += [f"  read {sentence}" for sentence in meta.get("read", ())]
     out += [f"  not read {sentence}" for sentence in meta.get("unread", ())]
     out += [f"  {remark}" for remark in meta.get("remarks", ())]
-    for stream, (count, first, last) in converted.read.items():
-        out.append(f"  {stream}: {count}, {first:.1f} to {last:.1f} s")
-    out += [f"  {topic}: {count}" for topic, count in converted.messages.items()]
-    for name, count in converted.left_out.items():
-        out.append(f"  {name}: {count} events left out, a bag has no place for them")
-    for topic, falls in meta.get("reordered", {}).items():
-        out.append(f"  {topic}: sorted, its stamps fell {falls} times")
-    if count := converted.tdoa_unknown_anchor:
+    out += [
+        f"  {stream}: {count}, {first:.1f} to {last:.1f} s"
+        for stream, (count, first, last) in made["read"].items()
+    ]
+    out += [f"  {topic}: {count}" for topic, count in made["messages"].items()]
+    out += [
+        f"  {name}: {count} events left out, a bag has no place for them"
+        for name, count in made["left_out"].items()
+    ]
+    out += [
+        f"  {topic}: sorted, its stamps fell {falls} times"
+        for topic, falls in meta.get("reordered", {}).items()
+    ]
+    if count := made["tdoa_unknown_anchor"]:
         out.append(
             f"  {count} measurements name an anchor that the survey does not have; check lists them"
         )
@@ -540,9 +489,8 @@ def _from_zero_on(flight: Flight) -> Flight:
 
     A shifted clock may start there, and a bag has no negative stamps.
     """
-    changed, remarks = {}, list(flight.meta.get("remarks", ()))
-    for name in _held(flight) if flight.start >= 0.0 else ():
-        stream = getattr(flight, name)
+    changed, remarks = dict[str, Any](), list(flight.meta.get("remarks", ()))
+    for name, stream in _held(flight).items() if flight.start >= 0.0 else ():
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
             changed[name] = rows_of(stream, inside)
@@ -555,12 +503,10 @@ def _from_zero_on(flight: Flight) -> Flight:
     )
 
 
-def _held(flight: Flight) -> list[str]:
-    return [
-        name
-        for name in CONVERTED
-        if getattr(flight, name) is not None and len(getattr(flight, name).t)
-    ]
+def _held(flight: Flight) -> dict[str, Timed]:
+    """Return {name: stream} of the streams that have messages."""
+    streams = {name: getattr(flight, name) for name in CONVERTED}
+    return {name: of for name, of in streams.items() if of is not None and len(of.t)}
 
 
 def _overlaps(one: Timed, flight: Flight) -> bool:
@@ -572,9 +518,9 @@ def _disjoint_sensors(flight: Flight) -> list[str]:
     """Return sentences on sensors without common time with TDOAs or ranges: another clock."""
     begin, end, remarks = flight.start, flight.end, []
     radio = "TDOAs" if len(flight.tdoa) else "ranges"
-    for name in _held(flight):
-        t = getattr(flight, name).t
-        if not _overlaps(getattr(flight, name), flight):
+    for name, stream in _held(flight).items():
+        t = stream.t
+        if not _overlaps(stream, flight):
             remarks.append(
                 f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} "
                 f"to {end:.1f} s: clocks that have no time in common; "

@@ -118,8 +118,7 @@ def rows(file: Path) -> Iterator[Row]:
     TooMuch
         If the file takes too long.
     """
-    with file.open("rb") as opened:
-        head = opened.read(len(SQLITE))
+    head = _head(file)
     if head.startswith(MCAP):
         return _from_mcap(file)
     if head == SQLITE:
@@ -330,11 +329,10 @@ class BagReader(Incomplete):
         self._most = most_unpacked(sum(file.stat().st_size for file in files))
         self._files = {}
         for file in files:
-            if _is_packed(file):
-                whole = _unpacked(file, folder, budget, self._most)
+            if _head(file).startswith(ZSTD):
+                self._files[file] = _unpacked(file, folder, budget, self._most)
             else:
-                whole = merged(file, folder, self.remarks)
-            self._files[file] = whole
+                self._files[file] = merged(file, folder, self.remarks)
         self._scan()
         count = sum(connection.msgcount for connection in self.connections)
         if not count and (self.remarks or not files):
@@ -436,9 +434,9 @@ def _listed(folder: Path, stated: dict[str, Any], remarks: list[str]) -> list[Pa
     return list(files or there.values())
 
 
-def _is_packed(file: Path) -> bool:
+def _head(file: Path) -> bytes:
     with file.open("rb") as opened:
-        return opened.read(len(ZSTD)) == ZSTD
+        return opened.read(len(SQLITE))
 
 
 def _unpacked(file: Path, folder: Path, budget: Budget, most: int) -> Path:

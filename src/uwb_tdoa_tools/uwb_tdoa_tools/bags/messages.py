@@ -15,7 +15,7 @@ from operator import attrgetter
 import os
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import (
@@ -29,22 +29,15 @@ from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import DEFINITION_BYTES, InputError
 from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
-from uwb_tdoa_bias.common.sensors import SENSORS, Sensor, Stream
+from uwb_tdoa_bias.common.sensors import SENSORS, Sensor
 from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_ekf.results import Odometry, pose_and_twist
 
-if TYPE_CHECKING:
-    from rosbags.typesys.store import Typestore
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-
-    RowOfMessage = Callable[[Any], tuple[float, ...] | None]
-    StreamOfRows = Callable[[np.ndarray, np.ndarray], Stream]  # of stamps (n,) s and rows (n, k)
-    Validity = Callable[[np.ndarray], np.ndarray]  # of rows (n, k): (n, k) bool
-
+RowOfMessage = Callable[[Any], tuple[float, ...] | None]
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = (

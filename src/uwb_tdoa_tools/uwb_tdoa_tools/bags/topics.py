@@ -8,7 +8,7 @@ Sensors outside of the body frame are transformed as in the nodes.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
@@ -27,7 +27,7 @@ from rosbags.interfaces import (
 )
 from rosbags.typesys.store import Typestore
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.sensors import SENSORS, Sensor
@@ -155,6 +155,14 @@ class Recorded(NamedTuple):
         )
 
 
+def surveyed(path: str | Path, recorded: Recorded | None, topic: str) -> Recorded:
+    """Return the anchors of a bag. Raise InputError without any, and for faulty ones."""
+    if recorded is None:
+        raise InputError(f"{path}: has no message on {topic}; give a survey file (--survey FILE).")
+    refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
+    return recorded
+
+
 def recorded_anchors(path: str | Path, reader: BagReader, topic: str) -> Recorded | None:
     """Return the last Anchors of an open bag, or None.
 
@@ -181,10 +189,7 @@ def _of_frames(path: str | Path, reader: BagReader) -> Recorded | None:
             # drivers without orientations write the identity
             turn = [q.x, q.y, q.z, q.w] if abs(q.w) < 1.0 else [np.nan] * 4
             by_parent[each.header.frame_id][int(found[1])] = [p.x, p.y, p.z, *turn]
-    frames = [(parent, rows) for parent, rows in by_parent.items() if len(rows) >= FEWEST]
-    if len(frames) != 1:
-        return None
-    return _recorded(path, TF_STATIC, *frames[0])
+    return _recorded(path, TF_STATIC, by_parent)
 
 
 def _of_markers(path: str | Path, reader: BagReader) -> Recorded | None:
@@ -205,14 +210,19 @@ def _of_markers(path: str | Path, reader: BagReader) -> Recorded | None:
                         p.z,
                         *[np.nan] * 4,
                     ]
-        frames = [(frame, rows) for frame, rows in by_frame.items() if len(rows) >= FEWEST]
-        if len(frames) == 1:
-            return _recorded(path, connection.topic, *frames[0])
+        if found := _recorded(path, connection.topic, by_frame):
+            return found
     return None
 
 
-def _recorded(path: str | Path, source: str, frame: str, rows: dict[int, list[float]]) -> Recorded:
-    """Return the anchors of rows {id: position and quaternion}."""
+def _recorded(
+    path: str | Path, source: str, by_frame: dict[str, dict[int, list[float]]]
+) -> Recorded | None:
+    """Return the anchors of {frame: {id: position and quaternion}}; None unless one frame has enough."""
+    frames = [(frame, rows) for frame, rows in by_frame.items() if len(rows) >= FEWEST]
+    if len(frames) != 1:
+        return None
+    frame, rows = frames[0]
     table = np.array(list(rows.values()))
     try:
         return Recorded(
@@ -347,29 +357,41 @@ class TopicMessages:
         return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
 
 
-def arrivals(found: Mapping[str, TopicMessages]) -> dict[str, np.ndarray]:
-    """Return {stream: (n,) s, times of recording}; NaN if they equal the stamps."""
+class BagStreams(NamedTuple):
+    """Streams of a bag in the order of arrival, on one continuous time, without outliers.
+
+    Attributes
+    ----------
+    found : {stream: TopicMessages}.
+    arrivals : {stream: (n,) s, times of recording}; NaN if they equal the stamps.
+    clock : changes of the stamps.
+    frames : Frames of the bag.
+    """
+
+    found: dict[str, TopicMessages]
+    arrivals: dict[str, np.ndarray]
+    clock: Straightened
+    frames: Frames
+
+
+def read_streams(
+    path: str | Path, reader: BagReader, name_of: Names, names: Iterable[str] = STREAMS
+) -> BagStreams:
+    """Read the named STREAMS of an open bag. Raises InputError."""
+    frames = read_frames(path, reader, name_of)
+    found = {name: read_stream(path, reader, name, name_of, frames) for name in names}
     known = any(bool((of.stamps != of.arrived).any()) for of in found.values())
-    return {
+    arrivals = {
         name: of.arrived / 1e9 if known else np.full(len(of.arrived), np.nan)
         for name, of in found.items()
     }
-
-
-def on_one_clock(
-    found: Mapping[str, TopicMessages],
-) -> tuple[dict[str, TopicMessages], Straightened]:
-    """Put the messages of a recording on a continuous time and remove outliers.
-
-    Returns the messages and the changes.
-    """
-    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, arrivals(found))
-    out = dict(found)
+    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, arrivals)
     for name in {*clock.shifts, *clock.kept}:
         of, kept = found[name], clock.kept.get(name, slice(None))
         stamps = of.stamps + np.round(1e9 * clock.shifts.get(name, np.zeros(1))).astype(np.int64)
-        out[name] = replace(of, stamps=stamps[kept], arrived=of.arrived[kept], rows=of.rows[kept])
-    return out, clock
+        found[name] = replace(of, stamps=stamps[kept], arrived=of.arrived[kept], rows=of.rows[kept])
+        arrivals[name] = arrivals[name][kept]
+    return BagStreams(found, arrivals, clock, frames)
 
 
 def read_topic(

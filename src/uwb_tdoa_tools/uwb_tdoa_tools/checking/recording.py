@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
@@ -24,14 +24,13 @@ from ..bags.topics import (
     TF_STATIC,
     Names,
     TopicMessages,
-    arrivals,
     imu_in_body,
-    on_one_clock,
     place_in_body,
-    read_frames,
     read_stream,
+    read_streams,
     recorded_anchors,
     sensor_place,
+    surveyed,
 )
 from ..command_lines import suggest_line
 
@@ -199,24 +198,19 @@ def of_flight(flight: Flight) -> Recording:
 
 def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Recording:
     name_of = Names(reading.namespace, reading.topics)
+    of_anchors = name_of("uwb/anchors")
     with open_bag(path) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        tree = read_frames(path, reader, name_of)
-        found = {name: read_stream(path, reader, name, name_of, tree) for name in STREAMS}
-        poses = found.pop("pose")
-        arrival = arrivals(found)
-        found, clock = on_one_clock(found)
-        tdoa, imu = found["tdoa"], found["imu"]
-        arrival = {
-            name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")
-        }
-        sensors = {
-            name: STREAMS[name].make(found[name].stamps / 1e9, found[name].rows)
-            for name in SENSORS
-            if len(found[name].stamps)
-        }
-        recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
-        remarks = (*remarks_of(reader), *(each for of in found.values() for each in of.remarks))
+        bag = read_streams(path, reader, name_of, ("tdoa", "imu", *SENSORS))
+        poses = read_stream(path, reader, "pose", name_of, bag.frames)
+        recorded = recorded_anchors(path, reader, of_anchors)
+        remarks = (*remarks_of(reader), *(each for of in bag.found.values() for each in of.remarks))
+    tdoa, imu, clock = bag.found["tdoa"], bag.found["imu"], bag.clock
+    sensors = {
+        name: STREAMS[name].make(bag.found[name].stamps / 1e9, bag.found[name].rows)
+        for name in SENSORS
+        if len(bag.found[name].stamps)
+    }
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
         there = sorted(
             topic
@@ -229,25 +223,17 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
             hint = f"a recording of others needs a profile, which this line names: {suggest_line(path)}"
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
     given = as_named(survey)
-    anchors = given.anchors if given else recorded and recorded.anchors
-    if anchors is None:
-        raise InputError(
-            f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file "
-            "(--survey FILE)."
-        )
-    refuse_faulty(
-        anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
-    )
+    anchors = (given or surveyed(path, recorded, of_anchors)).anchors
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
-    if samples is not None and (place := sensor_place(tree, IMU, imu.frames)[0]):
+    if samples is not None and (place := sensor_place(bag.frames, IMU, imu.frames)[0]):
         samples = imu_in_body(samples, place)
     return Recording(
         name=path.stem.removesuffix("_bag"),
         anchors=anchors,
         tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(-1, 4)),
         imu=samples,
-        tdoa_arrival=arrival["tdoa"],
-        imu_arrival=arrival["imu"],
+        tdoa_arrival=bag.arrivals["tdoa"],
+        imu_arrival=bag.arrivals["imu"],
         frames={
             topic: dict(stream.frames)
             for topic, stream in ((TDOA, tdoa), (IMU, imu))
@@ -256,7 +242,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places={
             frame: place
             for frame in {*tdoa.frames, *imu.frames}
-            if (place := place_in_body(tree, frame))
+            if (place := place_in_body(bag.frames, frame))
         },
         topics=topics,
         read=frozenset(map(name_of, HEARD)),

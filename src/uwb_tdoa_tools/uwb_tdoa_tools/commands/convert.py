@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 import json
 import math
 from pathlib import Path
@@ -121,11 +121,11 @@ def _convert(args: Namespace) -> None:
             args.force,
         )
     if args.json:
-        cli.show(json.dumps(asdict(made), indent=2, default=str))
+        cli.show(json.dumps(made, indent=2, default=str))
         return
     cli.show(*described(made))
     cli.show(f"  -> {args.out}")
-    for sentence in made.apart:
+    for sentence in made["apart"]:
         cli.say("convert", sentence)
 
 
