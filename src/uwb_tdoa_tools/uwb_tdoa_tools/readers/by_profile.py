@@ -50,8 +50,12 @@ _MOMENT = re.compile(
     r"(?=\d)(?:(\d{4})[-/](\d\d?)[-/](\d\d?))?[T ]*(?:(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?))?"
     r"\s*(?:Z|UTC|([-+]\d\d):?(\d\d))?"
 )
-ENU_OF_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-FLU_OF_FRD = np.diag([1.0, -1.0, -1.0])
+AXES = {  # of a Source: rotation to ours
+    "enu": np.eye(3),
+    "ned": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    "flu": np.eye(3),
+    "frd": np.diag([1.0, -1.0, -1.0]),
+}
 
 
 @contextmanager
@@ -215,7 +219,7 @@ class _Request:
         has_survey : leave out positions of anchors.
         """
         self.table, self.source, self._names, self._held = table, source, names, held
-        self._place, default = tables.place, tables.time_of(table)
+        self._place, default = tables.place, tables.time
         # Then a comma in a cell may be a thousands separator.
         self._between_commas = isinstance(tables, CsvFiles) and tables.delimiters[table] == ","
         self._columns = _wanted(source, default)
@@ -242,13 +246,11 @@ class _Request:
         """Add the records of a block; of a recording with several tags, those of one."""
         met = np.ones(len(block.places), bool)
         for condition in self.source.where:
-            values = self._column(block, condition.path)
-            met &= np.array([condition.met(value) for value in values], bool)
-        self._left_out += len(met) - np.count_nonzero(met)
+            met &= [condition.met(value) for value in self._column(block, condition.path)]
+        self._left_out += np.count_nonzero(~met)
         of_tag = met
         if self.source.tag:
-            values = self._column(block, self.source.tag)
-            tags = np.array([name_of(value) for value in values], str)
+            tags = np.array([*map(name_of, self._column(block, self.source.tag))], str)
             self.tags.update(tags[met].tolist())
             of_tag = met & (tags == tag) if tag else met
         for stream, mine in self._columns.items():
@@ -260,11 +262,9 @@ class _Request:
             for name, column in raw.items():
                 cells = column if len(kept) == len(column) else [column[k] for k in kept]
                 if name in ANCHORS:
-                    known = {
-                        cell: self._ids.setdefault(name_of(cell), len(self._ids))
-                        for cell in dict.fromkeys(cells)
-                    }
-                    columns[name] = np.array([known[cell] for cell in cells], np.int64)
+                    names = {cell: name_of(cell) for cell in dict.fromkeys(cells)}
+                    numbers = [self._ids.setdefault(names[cell], len(self._ids)) for cell in cells]
+                    columns[name] = np.array(numbers, np.int64)
                 else:
                     columns[name] = self._numbers(stream, name, cells, columns["place"])
             self._read[stream].append(columns)
@@ -273,14 +273,13 @@ class _Request:
         """Return the values at a path; sums of times in s, "" where a part is none."""
         if path in self._names:
             return [self._names[path]] * len(block.places)
-        parts = parts_of(path)
-        if len(parts) == 1:
+        if path in block.columns:
             return block.columns[path]
-        times = [[as_time(value) for value in block.columns[part]] for part, _ in parts]
-        factors = [factor for _, factor in parts]
+        parts = parts_of(path)
+        times = zip(*(map(as_time, block.columns[part]) for part, _ in parts))
         return [
-            "" if None in each else sum(t * factor for t, factor in zip(each, factors))
-            for each in zip(*times)
+            "" if None in each else sum(t * factor for t, (_, factor) in zip(each, parts))
+            for each in times
         ]
 
     def _counts(self, stream: str, values: tuple[Any, ...]) -> bool:
@@ -327,7 +326,7 @@ class _Request:
             placed = mine[
                 mine.any(axis=1)
             ]  # drivers write zeros where they do not know the position
-            out[names[number]] = _axes_of_world(self.source) @ (placed if len(placed) else mine)[-1]
+            out[names[number]] = AXES[self.source.world] @ (placed if len(placed) else mine)[-1]
             shift = np.abs(np.diff(placed, axis=0)).max(initial=0.0)
             if shift > MOVED:
                 remarks.append(
@@ -414,22 +413,16 @@ def _in_our_axes(
     if stream in ("gyro", "acc") and source.body == "frd":
         out["y"], out["z"] = -out["y"], -out["z"]
     if stream == "pose" and source.world == "ned":
-        out.update(zip("xyz", ENU_OF_NED @ np.stack([out[axis] for axis in "xyz"])))
+        out.update(zip("xyz", AXES["ned"] @ np.stack([out[axis] for axis in "xyz"])))
     if stream == "pose" and ATTITUDE <= arrays.keys():
         q = np.stack([out[f"q{k}"] for k in "xyzw"], axis=1)
         known = np.isfinite(q).all(axis=1) & (np.abs(q).max(axis=1) > 0.0)
         if source.world == "ned" or source.body == "frd":
-            body = FLU_OF_FRD if source.body == "frd" else np.eye(3)
-            safe = np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0])
-            matrices = _axes_of_world(source) @ Rotation.from_quat(safe).as_matrix() @ body
+            turned = Rotation.from_quat(np.where(known[:, None], q, [0.0, 0.0, 0.0, 1.0]))
+            matrices = AXES[source.world] @ turned.as_matrix() @ AXES[source.body]
             q = Rotation.from_matrix(matrices).as_quat()
         out.update(zip((f"q{k}" for k in "xyzw"), np.where(known[:, None], q, np.nan).T))
     return out
-
-
-def _axes_of_world(source: Source) -> np.ndarray:
-    """Return the rotation (3, 3) from the world axes of a Source to ours."""
-    return ENU_OF_NED if source.world == "ned" else np.eye(3)
 
 
 def _requests(
@@ -516,7 +509,8 @@ def _paths(source: Source, columns: Iterable[Columns] | None = None) -> set[str]
     """Return the columns that are read, also to decide which records count."""
     read = _wanted(source).values() if columns is None else columns
     paths = {path for mine in read for path, _ in mine.values()}
-    return {part for path in paths for part, _ in parts_of(path)} | source.conditions
+    deciding = {source.tag, *(condition.path for condition in source.where)} - {""}
+    return {part for path in paths for part, _ in parts_of(path)} | deciding
 
 
 def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[str, Columns]:
@@ -684,18 +678,15 @@ class _Arrays(Foreign):
 
     place = "row"
 
-    def __init__(self, columns: dict[str, dict[str, np.ndarray]]) -> None:
+    def __init__(self, arrays: dict[str, dict[str, np.ndarray]]) -> None:
         super().__init__()
-        self._columns, self.types = columns, dict.fromkeys(columns, "arrays")
-
-    def fields(self, table: str) -> list[str]:
-        """Return the columns of a table."""
-        return [*self._columns[table]]
+        self._arrays, self.types = arrays, dict.fromkeys(arrays, "arrays")
+        self.columns = {table: [*columns] for table, columns in arrays.items()}
 
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the rows of tables."""
         for number, (table, _, paths) in enumerate(wanted):
-            columns = {path: self._columns[table][path].tolist() for path in paths}
+            columns = {path: self._arrays[table][path].tolist() for path in paths}
             yield Block(number, [*range(1, 1 + len(columns[paths[0]]))], columns)
 
 

@@ -33,7 +33,7 @@ from uwb_tdoa_bias.common.errors import (
 )
 
 from ..bags import is_ros_1
-from ..bags.files import BagReader, Damaged, Decoder, Incomplete, open_bag, readable, remarks_of
+from ..bags.files import BagReader, Damaged, Incomplete, open_bag, readable, remarks_of
 from ..bags.topics import Recorded, recorded_anchors
 from .tables import BLOCK, Block, Foreign, Wanted
 
@@ -59,6 +59,8 @@ _BETWEEN_TYPES = "=" * 80 + "\n"  # line between the types of a definition in ID
 class ForeignBag(Foreign):
     """Topics of open bags that together are one recording: {topic: type of its messages}."""
 
+    time = STAMP, 1.0
+
     def __init__(self, readers: Mapping[Path, Reader], definitions: Mapping[str, str]) -> None:
         """Keep open bags; see `open_foreign`. Raises InputError."""
         super().__init__()
@@ -79,10 +81,6 @@ class ForeignBag(Foreign):
                         store = self._store(path, connection)
                         return [name for name, _ in store.fielddefs[connection.msgtype][1]]
         return []
-
-    def time_of(self, topic: str) -> tuple[str, float]:
-        """Return the field with the time of a message, and its unit in s."""
-        return STAMP, 1.0
 
     def recorded_anchors(self) -> Recorded | None:
         """Return the anchors in frames or markers of a bag of ROS 2, or None. Raises InputError."""
@@ -116,9 +114,10 @@ class ForeignBag(Foreign):
     def sample(self, table: str, most: int) -> dict[tuple[str, str], list[Any]]:
         """Return {(path, array that it lies in, or ""): values} of the first messages of a topic."""
         messages = [message for _, _, message in islice(self._messages({table}), most)]
-        found: dict[tuple[str, str], list[Any]] = {}
-        for message in messages:  # an array may be empty in the first
-            found |= {key: [] for key in message.paths()}
+        # an array may be empty in the first
+        found: dict[tuple[str, str], list[Any]] = {
+            key: [] for message in messages for key in message.paths()
+        }
         for message in messages:
             for (path, each), values in found.items():
                 with suppress(KeyError):
@@ -130,17 +129,14 @@ class ForeignBag(Foreign):
         numbers: Counter[str] = Counter()
         for path, reader in self._readers.items():
             wanted = [each for each in reader.connections if each.topic in topics]
-            decoders = {each.id: self._decoder(path, reader, each) for each in wanted}
+            decode = "deserialize_cdr" if isinstance(reader, BagReader) else "deserialize_ros1"
+            decoders = {each.id: getattr(self._store(path, each), decode) for each in wanted}
             for connection, received, content in readable(reader, wanted, decoders):
                 topic, message = connection.topic, Message(content, received)
                 numbers[topic] += 1
                 self.unstamped[topic] += not message.is_stamped
                 yield topic, numbers[topic], message
             self.remarks += [each for each in remarks_of(reader) if each not in self.remarks]
-
-    def _decoder(self, path: Path, reader: Reader, connection: Connection) -> Decoder:
-        store = self._store(path, connection)
-        return store.deserialize_cdr if isinstance(reader, BagReader) else store.deserialize_ros1
 
     def _store(self, path: Path, connection: Connection) -> Typestore:
         """Return the types of a topic: as in the bag, else of ROS or of the profile."""

@@ -55,12 +55,9 @@ def find_flights(
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
     pairs = [(path, _survey_of(path, survey)) for path in found]
-    if absolute:
-        pairs = [
-            (path.absolute(), its_survey and Path(its_survey).absolute())
-            for path, its_survey in pairs
-        ]
-    return pairs
+    return (
+        [(path.absolute(), of and Path(of).absolute()) for path, of in pairs] if absolute else pairs
+    )
 
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:

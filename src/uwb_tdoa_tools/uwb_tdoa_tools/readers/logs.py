@@ -224,12 +224,13 @@ def _read_header(
         raise InputError(
             f"{path}: is an event log of version {version}; versions 1 and 2 can be read."
         )
-    events, names, budget = {}, set(), Budget(path)
+    events: dict[int, tuple[str, list[tuple[str, str]]]] = {}
+    budget = Budget(path)
     for _ in range(number("the number of event types")):
         budget.spend("event types", 1, USD_TYPES)
         where, event = at, number("the id of an event type")
         name = string("the name of an event type")
-        fields, known = [], set()
+        fields: dict[str, str] = {}
         for _ in range(number(f"the number of variables of {name}")):
             budget.spend("variables", 1, USD_VARIABLES)
             variable = string(f"a variable of {name}")
@@ -238,22 +239,20 @@ def _read_header(
                 variable[-3:] != f"({code})"
                 or code not in _NUMPY_OF_STRUCT
                 or not field
-                or field in known
+                or field in fields
             ):
                 raise InputError(
                     f"{path}: byte {at - len(variable) - 1}: {variable!r} is not a new "
                     f"variable of {name} (expected "
                     f"'name(c)', c one of {' '.join(_NUMPY_OF_STRUCT)}); the file is damaged."
                 )
-            fields.append((field, _NUMPY_OF_STRUCT[code]))
-            known.add(field)
-        if event in events or name in names:
+            fields[field] = _NUMPY_OF_STRUCT[code]
+        if event in events or any(name == other for other, _ in events.values()):
             raise InputError(
                 f"{path}: byte {where}: event type {event} {name!r} is defined twice; the "
                 "file is damaged."
             )
-        events[event] = (name, fields)
-        names.add(name)
+        events[event] = name, [*fields.items()]
     return version, events, at
 
 

@@ -109,10 +109,8 @@ def parse_column(where: str, ours: str, theirs: str) -> tuple[str, float]:
         raise _unknown(where, entry)
     name, colon, unit = (part.strip() for part in theirs.rpartition(":"))
     units = UNITS[ours]
-    if not colon:
+    if not colon or (units is TIME and len(parts_of(theirs)) > 1):
         name, unit = theirs.strip(), next(iter(units))
-    if units is TIME and len(parts_of(theirs)) > 1:
-        name, unit = theirs.strip(), "s"
     sign = -1.0 if name.startswith("-") else 1.0
     name = name.removeprefix("-").strip()
     if not name:
@@ -165,10 +163,11 @@ def time_column(stream: str, columns: Columns) -> tuple[str, float] | None:
 
 
 SHIPPED = Path(__file__).resolve().parent / "profiles"
-BODY, WORLD = ("flu", "frd"), ("enu", "ned")  # axes; the first is ours
+_AXES = {"body": ("flu", "frd"), "world": ("enu", "ned")}  # the first is ours
+_TEXTS = "topic", "type", "each", "tag"
 MOST_STARS = 4  # of a pattern; the time to compare it grows with each
 _KEYS = {"about", "sources", "types", "antenna"}
-_SOURCE = {"topic", "type", "each", "where", "tag", "columns", "body", "world"}
+_SOURCE = {*_TEXTS, *_AXES, "where", "columns"}
 _NAME = re.compile(r"\{(\w+)\}")
 _COMPARISON = re.compile(r"(<=|>=|<|>)\s*(\S+)")
 _COMPARE = {
@@ -219,7 +218,7 @@ class Source:
     each : path of an array; each of its entries is a record.
     where : Conditions.
     tag : path of the id of the tag; "" if the source holds one tag.
-    body, world : axes, of BODY and WORLD.
+    body, world : axes: flu or frd, enu or ned.
     """
 
     columns: Columns
@@ -228,13 +227,8 @@ class Source:
     each: str = ""
     where: tuple[Condition, ...] = ()
     tag: str = ""
-    body: str = BODY[0]
-    world: str = WORLD[0]
-
-    @property
-    def conditions(self) -> set[str]:
-        """Return the paths of the fields that decide which records count."""
-        return {condition.path for condition in self.where} | ({self.tag} - {""})
+    body: str = "flu"
+    world: str = "enu"
 
     def over(self, fields: Iterable[str]) -> list[tuple[Source, dict[str, str]]]:
         """Return [(Source, {name: text})] for each field of a pattern such as "d{a}-{b}".
@@ -273,12 +267,8 @@ class Source:
 
 def _expression(pattern: str) -> str:
     """Return the regular expression of a pattern of a topic or type."""
-    out = ""
-    for part in re.split(r"(\{\w+\}|\*)", pattern):
-        name = _NAME.fullmatch(part)
-        text = ".*" if part == "*" else re.escape(part)
-        out += f"(?P<{name[1]}>[^/]+)" if name else text
-    return out
+    named = re.sub(r"\\\{(\w+)\\\}", r"(?P<\1>[^/]+)", re.escape(pattern))
+    return named.replace(r"\*", ".*")
 
 
 @dataclass(frozen=True)
@@ -303,13 +293,11 @@ class Profile:
     @classmethod
     def of_columns(cls, columns: Columns) -> Profile:
         """Return the Profile of --columns: each stream from the file that has its columns."""
-        sources = []
-        for names in STREAMS.values():
-            mine = {name: columns[name] for name in names if name in columns}
-            times = {name: column for name, column in columns.items() if name.endswith("time")}
-            if mine:
-                sources.append(Source({**mine, **times}))
-        return cls("columns as given", tuple(sources))
+        times = {name: column for name, column in columns.items() if name.endswith("time")}
+        given = [
+            {name: columns[name] for name in names if name in columns} for names in STREAMS.values()
+        ]
+        return cls("columns as given", tuple(Source(mine | times) for mine in given if mine))
 
 
 def shipped() -> list[str]:
@@ -363,14 +351,13 @@ def _source(where: str, content: Any) -> Source:
         for ours, theirs in content["columns"].items()
     }
     check_columns(where, columns, time=False)
-    texts = {name: content.get(name, "") for name in ("topic", "type", "each", "tag")}
+    texts = {name: content.get(name, "") for name in _TEXTS}
     for name, value in texts.items():
         if not isinstance(value, str):
             raise InputError(f"{where}: {name} is {value!r}; it must be a text.")
         if value.count("*") > MOST_STARS:
             raise InputError(f"{where}: {name} has more than {MOST_STARS} stars; write names out.")
-    axes = {"body": BODY, "world": WORLD}
-    for name, known in axes.items():
+    for name, known in _AXES.items():
         if content.get(name, known[0]) not in known:
             raise InputError(
                 f"{where}: {name} is {content[name]!r}; it must be {' or '.join(known)}."
@@ -382,7 +369,7 @@ def _source(where: str, content: Any) -> Source:
         columns,
         where=tuple(_condition(str(path), value) for path, value in conditions.items()),
         **texts,
-        **{name: content.get(name, known[0]) for name, known in axes.items()},
+        **{name: content.get(name, known[0]) for name, known in _AXES.items()},
     )
 
 

@@ -281,10 +281,9 @@ def _fits(name: str, tables: Foreign, streams: set[str]) -> bool:
 
 
 def _has(tables: Foreign, table: str, source: Source) -> bool:
-    if source.match(tables.topic(table), tables.types[table]) is None:
-        return False
+    is_meant = source.match(tables.topic(table), tables.types[table]) is not None
     paths = {path for path, _ in source.columns.values()}
-    return not isinstance(tables, CsvFiles) or paths <= {*tables.fields(table)}
+    return is_meant and (not isinstance(tables, CsvFiles) or paths <= {*tables.fields(table)})
 
 
 def _lines(tables: Foreign, table: str, one: Suggestion) -> list[str]:

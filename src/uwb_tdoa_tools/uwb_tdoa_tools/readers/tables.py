@@ -79,29 +79,30 @@ class Foreign:
     Attributes
     ----------
     types : {table: type}.
+    columns : {table: names of its fields}.
+    time : field with the time and its unit in s, if every table has it.
     counts, unstamped : {table: messages}, {table: messages without a stamp}.
     remarks : sentences on what is missing, after reading.
     place : word for the place of a record.
     """
 
     place = "message"
+    time: tuple[str, float] | None = None
 
     def __init__(self) -> None:
         self.types: dict[str, str] = {}
+        self.columns: dict[str, list[str]] = {}
         self.counts: Counter[str] = Counter()
         self.unstamped: Counter[str] = Counter()
         self.remarks: list[str] = []
 
     def fields(self, table: str) -> list[str]:
         """Return the fields of a table."""
-        raise NotImplementedError
+        return self.columns[table]
 
     def topic(self, table: str) -> str:
         """Return what the topic of a profile is compared with."""
         return table
-
-    def time_of(self, table: str) -> tuple[str, float] | None:
-        """Return the field with the time and its unit in s, if tables of this kind have one."""
 
     def recorded_anchors(self) -> Any:
         """Return the anchors in a bag (`bags.topics.Recorded`), or None. Raises InputError."""
@@ -369,18 +370,13 @@ class CsvFiles(Foreign):
         """Read the headers. `salvage` : see CsvTable. Raises InputError."""
         super().__init__()
         self._salvage = salvage
-        self._names: dict[str, list[str]] = {}
         self.delimiters: dict[str, str] = {}
         for path in map(str, paths):
             table = CsvTable(path, TABLE_CELLS, salvage=salvage)
-            self._names[path], self.delimiters[path] = table.names, table.delimiter
+            self.columns[path], self.delimiters[path] = table.names, table.delimiter
             self.remarks += filter(None, [table.remark])
             self._open = {path: table}  # the last one: the content of all may be too much
-        self.types = dict.fromkeys(self._names, "CSV")
-
-    def fields(self, table: str) -> list[str]:
-        """Return the columns of a file."""
-        return self._names[table]
+        self.types = dict.fromkeys(self.columns, "CSV")
 
     def topic(self, table: str) -> str:
         """Return the name of a file."""
@@ -426,8 +422,10 @@ def is_ulog(path: Path) -> bool:
 class ULogFile(Foreign):
     """Messages of one ULog file: {message: the same}. Instances but the first are called NAME.1, NAME.2, ...
 
-    docs.px4.io, ULog file format.
+    Entries of arrays are fields as gyro_rad[0]. docs.px4.io, ULog file format.
     """
+
+    time = _TIME, 1e-6
 
     def __init__(self, paths: Sequence[Path], salvage: bool = False) -> None:
         """Read a file. Raises InputError."""
@@ -460,6 +458,7 @@ class ULogFile(Foreign):
             if data
         }
         self.types = {name: name for name in sorted(self._data)}
+        self.columns = {name: [*data] for name, data in self._data.items()}
         self.counts.update({name: len(data[_TIME]) for name, data in self._data.items()})
         if self._damage:
             self.remarks.append("the log is damaged: read what fits.")
@@ -522,14 +521,6 @@ class ULogFile(Foreign):
                     yield f"{prefix}{field}{place}", _NUMBERS[kind]
                 else:
                     yield from self._fields(kind, f"{prefix}{field}{place}.")
-
-    def fields(self, table: str) -> list[str]:
-        """Return the fields of a message; entries of arrays are fields as gyro_rad[0]."""
-        return [*self._data[table]]
-
-    def time_of(self, table: str) -> tuple[str, float]:
-        """Return the field with the time, and its unit in s."""
-        return _TIME, 1e-6
 
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the messages, of each Wanted at once. Raises InputError."""
