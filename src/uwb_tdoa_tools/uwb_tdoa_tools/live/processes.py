@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 import json
@@ -19,7 +19,7 @@ import shutil
 import signal
 import subprocess
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
@@ -35,15 +35,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import VERDICTS
 
 from ..bags.files import open_bag
-from .session import recorded_odometry, session, taken
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
-
-    from uwb_tdoa_bias.ros.topics import SubscribingNode
-
-    from .session import Stop
-
+from .session import Stop, recorded_odometry, session, taken
 
 STOP_LIMIT, PATIENCE = 10.0, 60.0  # s from SIGINT to SIGKILL; the latter if it must end well
 LOOK = 10.0  # s between two checks of the processes, and between two lines about them
@@ -134,7 +126,7 @@ def wait(
 class DiagnosticsListener:
     """Hold the newest status of each node on /diagnostics, and whether it still changes."""
 
-    def __init__(self, node: SubscribingNode) -> None:
+    def __init__(self, node: Node) -> None:
         self._newest: dict[str, dict[str, str]] = {}
         self._repeated: dict[str, int] = {}
         self._subscription = node.create_subscription(

@@ -108,16 +108,44 @@ class Follower:
         self._topic = _Topic(node, cls, topic, qos, nodes)
         self._newest: int | None = None  # ns, stamp of the newest message on the topic
         self._last_look: int | None = None  # ns, stamp of the replay at the last look
-        self._started: int | None = None  # ns, stamp of the first message on the topic
-        self._tdoas = _Tdoas(node, nodes)
+        self._started = math.inf  # ns, stamp of the first message on the topic
+        self._residuals: _Topic | None = None
+        self._sensor_wait = round(1e9 * SENSOR_SHARE * nodes.lag)
+        publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
+        residual = message_class(publishers[0].topic_type) if publishers else None
+        if residual is not None:
+            qos = subscription_qos([publisher.qos_profile for publisher in publishers])
+            qos.depth = 10 * READER_DEPTH
+            self._residuals = _Topic(node, residual, RESIDUAL, qos, nodes)
+        self._start_over()
+
+    def _start_over(self) -> None:
+        """Forget the TDOAs of a recording that ends or restarts."""
+        self._begin = -math.inf  # ns; older TDOAs need not leave the filter
+        self._played = -math.inf  # ns, newest stamp of a TDOA that was published
+        self._out = -math.inf  # ns, newest stamp that left the filter
+        if self._residuals is not None:
+            self._residuals.silent = False
+        self._first: deque[int] = deque()  # first stamps that were published
+        self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
+        self._learned = 0  # number of stamps from which `_shift` is known
+        self._sensors: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
+        # Whether START_STEP is too small, because the recorded IMU is behind the TDOAs.
+        self._behind = False
 
     def add_tdoa(self, stamp: int) -> None:
         """Note that a TDOA with this stamp, ns, was published."""
-        self._tdoas.add(stamp)
+        if stamp < self._played - LEAD:  # the recording restarts
+            self._start_over()
+        if self._played == -math.inf:
+            self._begin = stamp - 1
+        self._played = max(self._played, stamp)
+        if self._learned < LEARNED:
+            self._first.append(stamp)
 
     def add_sensor(self, topic: str, stamp: int) -> None:
         """Note that a measurement of one of the SENSORS with this stamp, ns, was published."""
-        self._tdoas.add_sensor(topic, stamp)
+        self._sensors[topic] = stamp
 
     def wait(self, stamp: int, stop: Stop) -> float:
         """Wait until a message may be published, and return how long that took, s.
@@ -133,21 +161,22 @@ class Follower:
         stop : Stop
             True once the wait shall end.
         """
-        return self._tdoas.wait(self._is_starting(stamp), stop) + self._wait_for_stamps(stamp, stop)
+        return self._wait_for_tdoas(self._is_starting(stamp), stop) + self._wait_for_stamps(
+            stamp, stop
+        )
 
     def _is_starting(self, stamp: int) -> bool:
         """Return whether bias_node may still lack poses at this stamp, ns."""
-        if self._started is not None and stamp < self._started - LEAD:  # the recording restarts
-            self._started = None
-        if self._started is None:
+        if stamp < self._started - LEAD:  # nothing has come, or the recording restarts
+            self._started = math.inf
             self._hear(self._topic.stamps())
-        return self._started is None or stamp < self._started + START
+        return stamp < self._started + START
 
     def _hear(self, stamps: list[int]) -> None:
         """Note the stamps, ns, of the messages that have come."""
         if stamps:
             self._newest = stamps[-1]
-            self._started = self._newest if self._started is None else self._started
+            self._started = self._newest if self._started == math.inf else self._started
 
     def _wait_for_stamps(self, stamp: int, stop: Stop) -> float:
         self._newest = stamp if self._newest is None else self._newest
@@ -162,6 +191,30 @@ class Follower:
             return 0.0
         self._last_look = stamp
         return self._topic.wait(self._hear, in_step, stop)
+
+    def _wait_for_tdoas(self, starting: bool, stop: Stop) -> float:
+        step = START_STEP if starting and not self._behind else STEP
+        if self._residuals is None or self._is_in_step(step):
+            return 0.0
+        waited = self._residuals.wait(self._learn, lambda: self._is_in_step(step), stop)
+        self._behind = self._behind or self._residuals.silent and step == START_STEP
+        return waited
+
+    def _is_in_step(self, step: int) -> bool:
+        """Return whether the TDOAs that are older by `step`, ns, than the time of the filter have left it."""
+        sensors = [
+            stamp for stamp in self._sensors.values() if stamp > self._played - SENSOR_SILENT
+        ]
+        time_of_filter = max(min((self._played, *sensors)), self._played - self._sensor_wait)
+        return time_of_filter - step <= max(self._begin, self._out + self._shift)
+
+    def _learn(self, stamps: list[int]) -> None:
+        """Note stamps that left the filter. The first ones show by how much an effect shifts them."""
+        self._out = max([self._out, *stamps])
+        for stamp in stamps[: len(self._first)]:
+            if self._learned < LEARNED:
+                self._shift = max(self._shift, self._first.popleft() - stamp)
+                self._learned += 1
 
 
 class _Topic:
@@ -199,72 +252,6 @@ class _Topic:
             self.silent = self._nodes.are_idle()
             time.sleep(POLL_PERIOD)
         return time.monotonic() - began
-
-
-class _Tdoas:
-    """Count how far the published TDOAs have left the filter, in the order of their stamps."""
-
-    def __init__(self, node: Node, nodes: Nodes) -> None:
-        self._topic: _Topic | None = None
-        self._sensor_wait = round(1e9 * SENSOR_SHARE * nodes.lag)
-        publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(RESIDUAL))
-        cls = message_class(publishers[0].topic_type) if publishers else None
-        if cls is not None:
-            qos = subscription_qos([publisher.qos_profile for publisher in publishers])
-            qos.depth = 10 * READER_DEPTH
-            self._topic = _Topic(node, cls, RESIDUAL, qos, nodes)
-        self._start_over()
-
-    def _start_over(self) -> None:
-        self._begin = -math.inf  # ns; older TDOAs need not leave the filter
-        self._newest: int | None = None  # ns, newest stamp that was published
-        self._out = -math.inf  # ns, newest stamp that left the filter
-        if self._topic is not None:
-            self._topic.silent = False
-        self._first: deque[int] = deque()  # first stamps that were published
-        self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
-        self._learned = 0  # number of stamps from which `_shift` is known
-        self._sensors: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
-        # Whether START_STEP is too small, because the recorded IMU is behind the TDOAs.
-        self._behind = False
-
-    def add(self, stamp: int) -> None:
-        if self._newest is not None and stamp < self._newest - LEAD:  # the recording restarts
-            self._start_over()
-        if self._newest is None:
-            self._begin, self._newest = stamp - 1, stamp
-        self._newest = max(self._newest, stamp)
-        if self._learned < LEARNED:
-            self._first.append(stamp)
-
-    def add_sensor(self, topic: str, stamp: int) -> None:
-        self._sensors[topic] = stamp
-
-    def wait(self, starting: bool, stop: Stop) -> float:
-        if self._topic is None or self._newest is None:
-            return 0.0
-        step = START_STEP if starting and not self._behind else STEP
-        if self._is_in_step(step):
-            return 0.0
-        waited = self._topic.wait(self._learn, lambda: self._is_in_step(step), stop)
-        self._behind = self._behind or self._topic.silent and step == START_STEP
-        return waited
-
-    def _is_in_step(self, step: int) -> bool:
-        assert self._newest is not None
-        sensors = [
-            stamp for stamp in self._sensors.values() if stamp > self._newest - SENSOR_SILENT
-        ]
-        time_of_filter = max(min((self._newest, *sensors)), self._newest - self._sensor_wait)
-        return time_of_filter - step <= max(self._begin, self._out + self._shift)
-
-    def _learn(self, stamps: list[int]) -> None:
-        """Note stamps that left the filter. The first ones show by how much an effect shifts them."""
-        self._out = max([self._out, *stamps])
-        for stamp in stamps[: len(self._first)]:
-            if self._learned < LEARNED:
-                self._shift = max(self._shift, self._first.popleft() - stamp)
-                self._learned += 1
 
 
 def is_stamped(cls: Any) -> bool:
@@ -539,11 +526,6 @@ def is_sensor(publisher: Publisher) -> bool:
     )
 
 
-def is_imu(publisher: Publisher) -> bool:
-    """Return whether a publisher has inertial samples for ekf_node."""
-    return _kind(publisher) == "Imu" and not is_sensor(publisher)
-
-
 def _kind(publisher: Publisher) -> str:
     """Return the name of the class of the messages."""
     return publisher.msg_type.__name__  # type: ignore[attr-defined]  # rclpy says of the class that it is a message
@@ -645,10 +627,7 @@ class Player:
         them receives all other topics too, including the best-effort ones.
         """
         began = time.perf_counter()
-        for publisher in self._latched:
-            while time.perf_counter() < began + LATCHED_LIMIT and not self._stop:
-                if publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
-                    break
+        _wait_acknowledged(self._latched, LATCHED_LIMIT, self._stop)
         self._latched = []
         return time.perf_counter() - began
 
@@ -761,11 +740,11 @@ class Replayed:
         {fault of the followed nodes: count}.
     """
 
-    played: Played = field(default_factory=Played)
-    took: float = 0.0
-    acknowledged: bool = True
-    stopped_by: int | None = None
-    wrong: dict[str, int] = field(default_factory=dict)
+    played: Played
+    took: float
+    acknowledged: bool
+    stopped_by: int | None
+    wrong: dict[str, int]
 
 
 def replay(
@@ -820,7 +799,9 @@ def replay(
             if not options.loop:
                 break
         took = time.perf_counter() - began
-        acknowledged = _wait_acknowledged(publishers.values(), stop)
+        acknowledged = _wait_acknowledged(publishers.values(), ACKNOWLEDGE_LIMIT, stop)
+        # Best-effort subscriptions acknowledge nothing, and may read from the memory of this process.
+        time.sleep(SETTLE)
         wrong = nodes.faults(player.count, stop) if nodes else {}
         return Replayed(player.played, took, acknowledged, stop.signal, wrong)
 
@@ -922,7 +903,6 @@ def _wait_for_listeners(
         if (enough and followed and matched) or now > began + options.wait:
             break
         time.sleep(0.01)
-    without = [publishers[topic].topic_name for topic in missing]
     unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
     if not stop and (unheard or len(missing) == len(wanted)):
         what = unheard[0] if unheard else "any topic of the bag"
@@ -932,7 +912,8 @@ def _wait_for_listeners(
             "(--wait-matched)."
         )
     if missing:
-        say(f"nobody subscribes to {', '.join(without)}")
+        without = ", ".join(publishers[topic].topic_name for topic in missing)
+        say(f"nobody subscribes to {without}")
     time.sleep(SETTLE)
 
 
@@ -963,9 +944,9 @@ def _remark_imu(
     """Give the remedy if ekf_node uses an IMU and the bag has no inertial samples."""
     space = node.get_namespace()
     if ("ekf_node", space) not in node.get_node_names_and_namespaces() or any(
-        connection.msgcount and is_imu(publishers[connection.topic])
+        connection.msgcount and _kind(publisher) == "Imu" and not is_sensor(publisher)
         for connection in connections
-        if connection.topic in publishers
+        if (publisher := publishers.get(connection.topic))
     ):
         return
     name = f"{space.rstrip('/')}/ekf_node"
@@ -991,13 +972,11 @@ def _tell_progress(
     say(f"played {played:.1f} of {length:.1f} s in {took:.0f} s{waiting}{rest}")
 
 
-def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
-    """Return whether every subscription has every message, after at most ACKNOWLEDGE_LIMIT."""
-    until = time.monotonic() + ACKNOWLEDGE_LIMIT
+def _wait_acknowledged(publishers: Iterable[Publisher], limit: float, stop: Stop) -> bool:
+    """Return whether every subscription has every message, after at most `limit` s."""
+    until = time.monotonic() + limit
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
             if stop or time.monotonic() > until:
                 return False
-    # Best-effort subscriptions acknowledge nothing, and may read from the memory of this process.
-    time.sleep(SETTLE)
     return True

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-import math
 from pathlib import Path
 import signal
 import time
@@ -97,25 +96,6 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
-    """Return a function that returns the first Future of ask() that is done, or None so far.
-
-    It asks again AGAIN s after the last time: the middleware drops an answer to a client that it has
-    not met yet ("failed to send response (timeout)").
-    """
-    asked: list[Future] = []
-    due = -math.inf
-
-    def answered() -> Future | None:
-        nonlocal due
-        if time.monotonic() > due:
-            asked.append(ask())
-            due = time.monotonic() + AGAIN
-        return next((future for future in asked if future.done()), None)
-
-    return answered
 
 
 def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
@@ -225,6 +205,9 @@ def wait_for_names(node: Node) -> None:
 def parameter_of(node: Node, name: str, parameter: str) -> Any:
     """Return the value of a parameter, or None without an answer within ANSWER_LIMIT.
 
+    It asks again AGAIN s after the last time: the middleware drops an answer to a client that it has
+    not met yet ("failed to send response (timeout)").
+
     Parameters
     ----------
     node : Node
@@ -235,14 +218,18 @@ def parameter_of(node: Node, name: str, parameter: str) -> Any:
         Its name.
     """
     client = AsyncParameterClient(node, name)
-    answered, future = answer_of(partial(client.get_parameters, [parameter])), None
-    if client.wait_for_services(ANSWER_LIMIT):
-        until = time.monotonic() + ANSWER_LIMIT
-        while (future := answered()) is None and time.monotonic() < until:
-            rclpy.spin_once(node, timeout_sec=SPIN)
-    if future is None or future.result() is None or not future.result().values:
+    if not client.wait_for_services(ANSWER_LIMIT):
         return None
-    return parameter_value_to_python(future.result().values[0])
+    asked, due, until = list[Future](), 0.0, time.monotonic() + ANSWER_LIMIT
+    while (now := time.monotonic()) < until and not any(future.done() for future in asked):
+        if now > due:
+            asked.append(client.get_parameters([parameter]))
+            due = now + AGAIN
+        rclpy.spin_once(node, timeout_sec=SPIN)
+    answers = [future.result() for future in asked if future.done()]
+    if not answers or answers[0] is None or not answers[0].values:
+        return None
+    return parameter_value_to_python(answers[0].values[0])
 
 
 @dataclass(frozen=True)
