@@ -21,8 +21,7 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import SENSORS, Height, Pressure, Velocity
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
-from uwb_tdoa_tools.bags.messages import typestore
-from uwb_tdoa_tools.bags.topics import STREAMS, of_sensor
+from uwb_tdoa_tools.bags.messages import STREAMS, of_sensor, typestore
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER

@@ -23,8 +23,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
-from uwb_tdoa_tools.bags.messages import header_of, pose_of, transforms_message, typestore
-from uwb_tdoa_tools.bags.topics import STREAMS
+from uwb_tdoa_tools.bags.messages import STREAMS, header_of, pose_of, transforms_message, typestore
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.check import processed_streams
 from uwb_tdoa_tools.checking.recording import read_recording

@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import read_bag, typestore
 from uwb_tdoa_tools.bags.files import PLUGINS
-from uwb_tdoa_tools.bags.topics import STREAMS
+from uwb_tdoa_tools.bags.messages import STREAMS
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading

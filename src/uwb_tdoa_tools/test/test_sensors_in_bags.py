@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_tools.bags.messages import typestore
-from uwb_tdoa_tools.bags.topics import STREAMS
+from uwb_tdoa_tools.bags.messages import STREAMS, typestore
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 TOPICS = [(name, kind) for name, sensor in SENSORS.items() for _, kind in sensor.topics]

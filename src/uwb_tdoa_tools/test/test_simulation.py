@@ -525,7 +525,7 @@ SENSORS["side_sonar"] = replace(SENSORS["pressure"], name="side_sonar", paramete
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.bags.topics import topics_of
+from uwb_tdoa_tools.bags.messages import topics_of
 from uwb_tdoa_tools.simulation import SimulationConfig
 from uwb_tdoa_tools.commands.simulate import OPTIONS, config_of
 names = [{each.name for each in fields(kind)} for kind in (Flight, FilterConfig, SimulationConfig)]

@@ -15,7 +15,7 @@ from operator import attrgetter
 import os
 from pathlib import Path
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import (
@@ -24,6 +24,12 @@ from rosbags.interfaces import (
     MessageDefinition,
     MessageDefinitionFormat,
     Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
 )
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -154,6 +160,11 @@ def _definition(msgtype: str) -> str:
 
 
 BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
+
+
+def is_body(frame: str) -> bool:
+    """Return whether a frame_id is the body frame of any robot; an empty one counts as body."""
+    return frame.rpartition("/")[2] in (BODY_FRAME, "")
 
 
 def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
@@ -407,3 +418,110 @@ def pose_of(
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)
     )
+
+
+def _qos(durability: QosDurability, depth: int) -> Qos:
+    """Return a reliable QoS.
+
+    A reliable publisher serves reliable and best-effort subscriptions, and loses nothing.
+    """
+    endless = QosTime(9223372036, 854775807)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE,
+        durability,
+        endless,
+        endless,
+        QosLiveliness.AUTOMATIC,
+        endless,
+        False,
+    )
+
+
+STREAM_QOS = _qos(QosDurability.VOLATILE, 1000)
+LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
+
+
+class StreamKind(NamedTuple):
+    """How a stream of a Flight is read from a bag, and written.
+
+    Attributes
+    ----------
+    topic, message : our topic and its type.
+    row : convert a message to numbers, see `row_of`.
+    make : convert stamps s and rows to the stream.
+    content : convert a stream to the fields of messages, see `messages_of`.
+    valid : check which numbers of the rows are valid.
+    """
+
+    topic: str
+    message: str
+    row: RowOfMessage
+    make: Callable[[np.ndarray, np.ndarray], Any]
+    content: Callable[[Any], dict[str, Any]]
+    valid: Callable[[np.ndarray], np.ndarray] = valid
+
+    def messages(self, stream: Any, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
+        """Yield (stamp ns, message) of a stream in a frame."""
+        content = self.content(stream)
+        return messages_of(self.topic, self.message, stream.t, content, frame, store)
+
+
+def of_sensor(sensor: Sensor) -> StreamKind:
+    """Return the StreamKind of a Sensor."""
+    return StreamKind(
+        sensor.topics[0][0],
+        sensor.message,
+        row_of(*sensor.fields),
+        lambda stamps, rows: sensor.read(stamps, sensor.split(rows)),
+        sensor.content,
+        partial(valid_of_sensor, sensor),
+    )
+
+
+STREAMS = {
+    "tdoa": StreamKind(
+        "uwb/tdoa",
+        "uwb_tdoa_msgs/msg/Tdoa",
+        row_of("anchor_a", "anchor_b", "distance_difference", "variance"),
+        tdoas_of,
+        tdoa_content,
+    ),
+    "imu": StreamKind(
+        "imu/data",
+        "sensor_msgs/msg/Imu",
+        imu_row,
+        imu_of,
+        imu_content,
+    ),
+    **{name: of_sensor(sensor) for name, sensor in SENSORS.items()},
+    "pose": StreamKind(
+        "ground_truth/pose",
+        "geometry_msgs/msg/PoseStamped",
+        row_of("pose.position", "pose.orientation"),
+        truth_of,
+        pose_content,
+    ),
+}
+
+
+def topics_of(name: str) -> tuple[tuple[str, str], ...]:
+    """Return ((topic, type of its messages), ...) of a stream of a Flight, by our names."""
+    return (
+        SENSORS[name].topics if name in SENSORS else ((STREAMS[name].topic, STREAMS[name].message),)
+    )
+
+
+class Names:
+    """Absolute names of our topics in a bag."""
+
+    def __init__(self, namespace: str = "", topics: dict[str, str] | None = None) -> None:
+        """Keep namespace and topics, see `read_bag`."""
+        self._namespace, self._topics = namespace.strip("/"), topics or {}
+
+    def __call__(self, topic: str) -> str:
+        """Return the absolute name of a topic of this project, e.g. "uwb/tdoa"."""
+        name = self._topics.get(topic, topic)
+        absolute = name.startswith("/") or not self._namespace
+        return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"

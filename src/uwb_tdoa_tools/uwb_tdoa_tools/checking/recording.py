@@ -17,12 +17,9 @@ from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.common.survey import as_named
 
-from ..bags import is_bag, messages as bag_messages
-from ..bags.files import open_bag, remarks_of
-from ..bags.topics import (
-    STREAMS,
+from ..bags import is_bag
+from ..bags.bag import (
     TF_STATIC,
-    Names,
     TopicMessages,
     imu_in_body,
     place_in_body,
@@ -32,6 +29,8 @@ from ..bags.topics import (
     sensor_place,
     surveyed,
 )
+from ..bags.files import open_bag, remarks_of
+from ..bags.messages import STREAMS, Names, tdoas_of
 from ..command_lines import suggest_line
 
 if TYPE_CHECKING:
@@ -224,13 +223,13 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
     given = as_named(survey)
     anchors = (given or surveyed(path, recorded, of_anchors)).anchors
-    samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
+    samples = STREAMS["imu"].make(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := sensor_place(bag.frames, IMU, imu.frames)[0]):
         samples = imu_in_body(samples, place)
     return Recording(
         name=path.stem.removesuffix("_bag"),
         anchors=anchors,
-        tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(-1, 4)),
+        tdoa=tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(-1, 4)),
         imu=samples,
         tdoa_arrival=bag.arrivals["tdoa"],
         imu_arrival=bag.arrivals["imu"],
@@ -259,4 +258,4 @@ def _truth_of(found: TopicMessages) -> Truth | None:
     """Return the ground truth of a bag, without messages that are no numbers."""
     stamps, rows, _ = found.in_order()
     known = STREAMS["pose"].valid(rows).all(axis=1) if len(stamps) else np.zeros(0, bool)
-    return bag_messages.truth_of(stamps[known], rows[known]) if known.any() else None
+    return STREAMS["pose"].make(stamps[known], rows[known]) if known.any() else None

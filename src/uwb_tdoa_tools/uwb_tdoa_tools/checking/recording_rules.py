@@ -15,14 +15,15 @@ import numpy as np
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
-from ..bags.messages import BODY_FRAME
-from ..bags.topics import Place, is_body
+from ..bags.messages import BODY_FRAME, is_body
 from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU, Recording
 from .tdoa_rules import largest_displacement, same_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from uwb_tdoa_bias.common.transforms import Place
 
     from ..live.session import End
 

@@ -14,8 +14,7 @@ from rosbags.typesys.store import Typestore
 from uwb_tdoa_bias.common.anchors import Anchors
 
 from ..bags.files import new_bag
-from ..bags.messages import anchors_message, header_of, pose_of, typestore
-from ..bags.topics import LATCHED_QOS
+from ..bags.messages import LATCHED_QOS, anchors_message, header_of, pose_of, typestore
 from ..checking.coverage import to_copy
 from ..scoring.metrics import change_in_words
 from ..simulation.config import Room

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bz2
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
@@ -33,8 +33,8 @@ from uwb_tdoa_bias.common.errors import (
 )
 
 from ..bags import is_ros_1
+from ..bags.bag import Recorded, recorded_anchors
 from ..bags.files import BagReader, Damaged, Incomplete, open_bag, readable, remarks_of
-from ..bags.topics import Recorded, recorded_anchors
 from .tables import BLOCK, Block, Foreign, Wanted
 
 Path_ = tuple[str | int, ...]  # parsed path of a field
@@ -194,11 +194,11 @@ class Message:
     """
 
     def __init__(self, content: Any, received: int) -> None:
-        self._content, self._received = content, received
+        self._content = content
         stamp: Any = getattr(getattr(content, "header", content), "stamp", None)
         in_header = stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "nanosec") else 0
         self.is_stamped = in_header != 0
-        self._stamp = in_header or received  # ns
+        self._times = {RECEIVED: received / 1e9, STAMP: (in_header or received) / 1e9}
 
     def paths(self) -> list[tuple[str, str]]:
         """Return [(path of a number, text or stamp, the array that it lies in, or "")]."""
@@ -218,10 +218,8 @@ class Message:
 
         index : place in each array that the path does not index itself; "" beyond the end.
         """
-        if path == RECEIVED:
-            return self._received / 1e9
-        if path == STAMP:
-            return self._stamp / 1e9
+        if path in self._times:
+            return self._times[path]
         if path == INDEX:
             return index
         value = self._value(parsed(path), index)
@@ -304,11 +302,10 @@ def open_foreign(paths: Sequence[Path], definitions: Mapping[str, str]) -> Itera
     readers: dict[Path, Reader] = {}
     with ExitStack() as stack:
         for path in paths:
-            if is_ros_1(path):
-                readers[path] = ros_1 = Ros1Bag(path)
-                stack.callback(ros_1.close)
-            else:
-                readers[path] = stack.enter_context(open_bag(path))
+            opened: AbstractContextManager[Reader] = (
+                closing(Ros1Bag(path)) if is_ros_1(path) else open_bag(path)
+            )
+            readers[path] = stack.enter_context(opened)
         yield ForeignBag(readers, definitions)
 
 
