@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 import json
 import os
@@ -178,7 +178,7 @@ def _counts(values: dict[str, str]) -> dict[str, str]:
     return {key: value for key, value in values.items() if value.isdigit()}
 
 
-class Processes:
+class Processes(AbstractContextManager["Processes"]):
     """Run executables of our packages, each in a separate process group, with its output in a file.
 
     The context manager ends each process that it started.
@@ -189,9 +189,6 @@ class Processes:
         self._stop = stop
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._may_end: dict[str, Sequence[int]] = {}
-
-    def __enter__(self) -> Processes:
-        return self
 
     def __exit__(self, *_: object) -> None:
         for title in list(self._running)[::-1]:

@@ -573,7 +573,7 @@ class Player:
         self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
         self._sensors = {topic for topic, publisher in publishers.items() if is_sensor(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
-        self._start: int | None = None  # ns, stamp of the first message
+        self._start = 0  # ns, stamp of the first message
         self._began = self._next_tick = self._tell_next = 0.0
 
     def count(self, what: str) -> int:
@@ -587,10 +587,10 @@ class Player:
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
         """Publish an iterable of (connection, time of recording in ns, bytes) from the beginning."""
-        self._start, first = None, time.perf_counter()
+        first = time.perf_counter()
         waited_before, self._tell_next = self.played.waited, first + PROGRESS
-        for connection, stamp, data in recorded:
-            if self._start is None:
+        for number, (connection, stamp, data) in enumerate(recorded):
+            if number == 0:
                 self._start, self._began = stamp, time.perf_counter()
                 self._next_tick = self._began
             if (now := time.perf_counter()) > self._tell_next:
@@ -644,7 +644,7 @@ class Player:
             time.sleep(min(max(wake - now, 0.0), LONGEST_SLEEP))
 
     def _tick(self, now: float) -> None:
-        assert self._clock is not None and self._start is not None
+        assert self._clock is not None
         nanoseconds = self._start + int((now - self._began) * 1e9 * self._rate)
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
@@ -689,40 +689,6 @@ DISCOVERY = 2.0  # s without a new subscription after which the present ones suf
 
 
 @dataclass(frozen=True)
-class ReplayOptions:
-    """Options of a replay.
-
-    Attributes
-    ----------
-    rate : float
-        Times as fast as recorded.
-    loop : bool
-        Start again at the end.
-    clock_rate : float or None
-        Hz of /clock.
-    wait : float
-        s until a subscription must exist.
-    wait_topics : sequence of str
-        Topics that each need a subscription.
-    follow : str or None
-        Topic to keep in step with. The TDOAs of the bag then need a subscription.
-    ros_arguments : sequence of str
-        Command line with --ros-args.
-    packages : sequence of str
-        Further packages of message types to import.
-    """
-
-    rate: float = 1.0
-    loop: bool = False
-    clock_rate: float | None = None
-    wait: float = WAIT
-    wait_topics: Sequence[str] = ()
-    follow: str | None = None
-    ros_arguments: Sequence[str] = ()
-    packages: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class Replayed:
     """Result of a replay.
 
@@ -748,7 +714,16 @@ class Replayed:
 
 
 def replay(
-    bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print
+    bag: str | Path,
+    rate: float = 1.0,
+    loop: bool = False,
+    clock_rate: float | None = None,
+    wait: float = WAIT,
+    wait_topics: Sequence[str] = (),
+    follow: str | None = None,
+    ros_arguments: Sequence[str] = (),
+    packages: Sequence[str] = (),
+    say: Callable[[str], object] = print,
 ) -> Replayed:
     """Replay a bag over ROS topics.
 
@@ -756,8 +731,22 @@ def replay(
     ----------
     bag : path
         The bag.
-    options : ReplayOptions
-        How to replay it.
+    rate : float
+        Times as fast as recorded.
+    loop : bool
+        Start again at the end.
+    clock_rate : float or None
+        Hz of /clock.
+    wait : float
+        s until a subscription must exist.
+    wait_topics : sequence of str
+        Topics that each need a subscription.
+    follow : str or None
+        Topic to keep in step with. The TDOAs of the bag then need a subscription.
+    ros_arguments : sequence of str
+        Command line with --ros-args.
+    packages : sequence of str
+        Further packages of message types to import.
     say : callable
         Called with sentences about the progress.
 
@@ -770,33 +759,30 @@ def replay(
     InputError
         If the bag has no message, or nobody subscribes in time.
     """
-    with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
-        publishers = _publishers(node, bag, reader, say, options.packages)
+    with open_bag(bag) as reader, session("replay", list(ros_arguments)) as (node, stop):
+        publishers = _publishers(node, bag, reader, say, packages)
         connections = [
             connection for connection in reader.connections if connection.topic in publishers
         ]
-        count = sum(connection.msgcount for connection in connections)
-        if not count:
+        if not any(connection.msgcount for connection in connections):
             raise InputError(f"{bag}: has no message to replay.")
-        _wait_for_listeners(node, publishers, options, stop, say)
+        _wait_for_listeners(node, publishers, wait, wait_topics, follow, stop, say)
         wait_for_names(node)
         _leave_out_anchors(node, publishers, say)
         _remark_imu(node, publishers, connections, bag, say)
         connections = [each for each in connections if each.topic in publishers]
         count = sum(connection.msgcount for connection in connections)
         length = (reader.end_time - reader.start_time) / 1e9
-        tell = partial(_tell_progress, length, options.follow, say)
-        player = Player(node, publishers, options.rate, options.clock_rate, stop, tell)
-        nodes = Nodes(node, say) if options.follow else None
-        player.follower = (
-            Follower(node, options.follow, nodes) if options.follow and nodes else None
-        )
-        say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
+        tell = partial(_tell_progress, length, follow, say)
+        player = Player(node, publishers, rate, clock_rate, stop, tell)
+        nodes = Nodes(node, say) if follow else None
+        player.follower = Follower(node, follow, nodes) if follow and nodes else None
+        say(f"playing {count} messages, {length:.1f} s at rate {rate:g}")
         began = time.perf_counter()
         while not stop:
             with closing(read_ahead(reader.messages(connections))) as recorded:
                 player.play(recorded)
-            if not options.loop:
+            if not loop:
                 break
         took = time.perf_counter() - began
         acknowledged = _wait_acknowledged(publishers.values(), ACKNOWLEDGE_LIMIT, stop)
@@ -856,23 +842,25 @@ def _publishers(
 def _wait_for_listeners(
     node: Node,
     publishers: dict[str, Publisher],
-    options: ReplayOptions,
+    wait: float,
+    wait_topics: Sequence[str],
+    follow: str | None,
     stop: Stop,
     say: Callable[[str], object],
 ) -> None:
     """Wait until each wanted topic has a subscription, and the followed topic a publisher.
 
-    Wanted are the topics that the options name. Else all topics of the bag are wanted, and those
+    Wanted are `wait_topics`. Else all topics of the bag are wanted, and those
     with a subscription suffice once no further one has come for DISCOVERY s.
 
     Raises
     ------
     InputError
-        If after `options.wait` s a required topic, or every topic, has no subscription.
+        If after `wait` s a required topic, or every topic, has no subscription.
     """
-    needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
+    needed = [f"/{topic.lstrip('/')}" for topic in wait_topics]
     wanted = needed or list(publishers)
-    if options.follow and not needed:
+    if follow and not needed:
         needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
     missing = [topic for topic in wanted if topic not in publishers]
     if missing:
@@ -880,7 +868,7 @@ def _wait_for_listeners(
             f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}."
         )
     names = ", ".join(publishers[topic].topic_name for topic in wanted)
-    say(f"waiting up to {options.wait:g} s for subscriptions to {names}")
+    say(f"waiting up to {wait:g} s for subscriptions to {names}")
     began = changed = time.monotonic()
     missing = wanted
     heard: tuple[tuple[int, ...], ...] = ()
@@ -888,9 +876,7 @@ def _wait_for_listeners(
         now = time.monotonic()
         counts = tuple(publishers[topic].get_subscription_count() for topic in wanted)
         known = tuple(node.count_subscribers(publishers[topic].topic_name) for topic in wanted)
-        followed = not options.follow or node.count_publishers(
-            node.resolve_topic_name(options.follow)
-        )
+        followed = not follow or node.count_publishers(node.resolve_topic_name(follow))
         missing = [topic for topic, count in zip(wanted, counts) if not count]
         if (counts, known) != heard:
             heard, changed = (counts, known), now
@@ -900,14 +886,14 @@ def _wait_for_listeners(
             and not set(missing) & set(needed)
         )
         matched = all(count >= there for count, there in zip(counts, known))
-        if (enough and followed and matched) or now > began + options.wait:
+        if (enough and followed and matched) or now > began + wait:
             break
         time.sleep(0.01)
     unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
     if not stop and (unheard or len(missing) == len(wanted)):
         what = unheard[0] if unheard else "any topic of the bag"
         raise InputError(
-            f"nobody subscribes to {what} within {options.wait:g} s; start the nodes first, "
+            f"nobody subscribes to {what} within {wait:g} s; start the nodes first, "
             "or wait longer "
             "(--wait-matched)."
         )
@@ -922,13 +908,13 @@ def _leave_out_anchors(
 ) -> None:
     """Drop the publisher of anchors if each node that hears it has anchors of its own."""
     for topic, publisher in [*publishers.items()]:
-        if _kind(publisher) != "AnchorArray":
-            continue
         ends = node.get_subscriptions_info_by_topic(publisher.topic_name)
-        if not ends or not {end.node_name for end in ends} <= TAKE_ANCHORS_FILE:
-            continue
         names = sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
-        if all(parameter_of(node, name, "anchors_file") for name in names):
+        ours = (
+            _kind(publisher) == "AnchorArray"
+            and {end.node_name for end in ends} <= TAKE_ANCHORS_FILE
+        )
+        if ends and ours and all(parameter_of(node, name, "anchors_file") for name in names):
             say(f"leaving out {topic}: {', '.join(names)} have anchors_file, which counts")
             node.destroy_publisher(publisher)
             del publishers[topic]

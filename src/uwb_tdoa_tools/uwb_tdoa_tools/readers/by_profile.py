@@ -28,13 +28,13 @@ from .profile import (
     MOST_SKIPPED,
     RADIO,
     STREAMS,
+    TIMES,
     Columns,
     Profile,
     Source,
     check_columns,
     parse_column,
     parts_of,
-    time_column,
 )
 from .streams import Streams, by_time, make_flight
 from .tables import Block, CsvFiles, Foreign, ULogFile, Wanted, is_ulog
@@ -94,8 +94,9 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
             raise InputError(f"{path}: does not exist; give a recording.")
         inside = [path]
         if path.is_dir() and not is_bag(path):
-            files = sorted(path.iterdir())
-            inside = [file for file in files if file.name.endswith(ENDS) or is_bag(file)]
+            inside = [
+                file for file in sorted(path.iterdir()) if file.name.endswith(ENDS) or is_bag(file)
+            ]
         if not inside:
             raise InputError(
                 f"{path}: holds no CSV file, JSON lines, bag or ULog; give the files themselves."
@@ -376,7 +377,6 @@ class _Request:
                 name: values[~bad] * self._columns[stream][name][1]
                 for name, values in numbers.items()
             }
-            arrays |= {name: arrays[name].astype(np.int64) for name in {*ANCHORS} & arrays.keys()}
             self._stamps[stream] = arrays.get("t", np.zeros(0))
             if len(self._stamps[stream]):
                 out[stream] = _in_our_axes(stream, arrays, self.source)
@@ -518,7 +518,8 @@ def _wanted(source: Source, default: tuple[str, float] | None = None) -> dict[st
     wanted: dict[str, Columns] = {}
     for stream, known in STREAMS.items():
         mine = {name: source.columns[name] for name in known if name in source.columns}
-        time = time_column(stream, source.columns) or default
+        times = (source.columns.get(name) for name in (*TIMES[stream], "time"))
+        time = next(filter(None, times), default)
         if mine:
             wanted[stream] = mine | ({"t": time} if time and stream != SURVEY else {})
     return wanted
@@ -691,9 +692,7 @@ class _Arrays(Foreign):
 
 
 def _anchors_of(anchors: Any) -> NamedAnchors:
-    if isinstance(anchors, (Anchors, str, Path)):
-        named = as_named(anchors)
-        assert named is not None
+    if isinstance(anchors, (Anchors, str, Path)) and (named := as_named(anchors)):
         return named
     if not isinstance(anchors, Mapping):
         raise InputError(

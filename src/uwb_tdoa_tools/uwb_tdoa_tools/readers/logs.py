@@ -130,7 +130,7 @@ def read_usd_log(
             raise InputError(f"{path}: event {name} has no variable {missing[0]} (it has {known}).")
         streams[stream] = {"t": columns["t"], **{rename[field]: columns[field] for field in rename}}
     if "tdoa" in streams:
-        streams["tdoa"] = _tdoa(path, streams["tdoa"])
+        _check_ids(path, streams["tdoa"])
     return make_flight(Path(path).name, anchors, streams, extra, meta, salvage, truth)
 
 
@@ -168,8 +168,8 @@ def _gather(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return rows
 
 
-def _tdoa(path: str | Path, columns: Columns) -> Columns:
-    """Return the columns as the integers and doubles of `Tdoas`; the log has bytes and floats."""
+def _check_ids(path: str | Path, columns: Columns) -> None:
+    """Raise InputError for ids of anchors that are no whole numbers of 16 bits."""
     for name in ("a", "b"):
         values = columns[name].astype(float)
         bad = ~((values >= 0) & (values <= 65535) & (values == np.floor(values)))
@@ -179,8 +179,6 @@ def _tdoa(path: str | Path, columns: Columns) -> Columns:
                 f"{columns[name][bad][0]}; "
                 "it must be a whole number 0 ... 65535."
             )
-    types = {"t": float, "a": np.int64, "b": np.int64, "d": float}
-    return {column: np.asarray(values, dtype=types[column]) for column, values in columns.items()}
 
 
 def _read_header(

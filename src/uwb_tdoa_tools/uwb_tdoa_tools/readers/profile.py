@@ -157,11 +157,6 @@ def check_columns(where: str, columns: Columns, time: bool = True) -> None:
         raise InputError(f"{where}: {', '.join(sorted(ATTITUDE))} belong together.")
 
 
-def time_column(stream: str, columns: Columns) -> tuple[str, float] | None:
-    """Return the column with the time of a stream, or None."""
-    return next((columns[name] for name in (*TIMES[stream], "time") if name in columns), None)
-
-
 SHIPPED = Path(__file__).resolve().parent / "profiles"
 _AXES = {"body": ("flu", "frd"), "world": ("enu", "ned")}  # the first is ours
 _TEXTS = "topic", "type", "each", "tag"
@@ -259,10 +254,9 @@ class Source:
 
         table, kind : topic and type of its messages, or name of a CSV file and "CSV".
         """
-        if not re.fullmatch(_expression(self.type or "*"), kind):
-            return None
+        fits = re.fullmatch(_expression(self.type or "*"), kind)
         found = re.fullmatch(_expression(self.topic or "*"), table)
-        return None if found is None else found.groupdict()
+        return found.groupdict() if fits and found else None
 
 
 def _expression(pattern: str) -> str:

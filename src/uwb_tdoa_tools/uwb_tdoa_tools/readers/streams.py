@@ -217,7 +217,8 @@ def _sensors(streams: Streams, imu: Imu | None) -> dict[str, Any]:
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
     """Return (stamps s, ids of each anchor, values m, variances m^2 or 0 if unknown), (n,) each."""
     variance = columns["std"] ** 2 if "std" in columns else np.zeros(len(columns["t"]))
-    return columns["t"], *(columns[name] for name in ids), columns["d"], variance
+    numbers = (np.asarray(columns[name], np.int64) for name in ids)
+    return columns["t"], *numbers, np.asarray(columns["d"], float), variance
 
 
 def _valid_rows(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:

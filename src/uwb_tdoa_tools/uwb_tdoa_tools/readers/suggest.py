@@ -318,8 +318,6 @@ def _suggestions(tables: Foreign, table: str, by_values: bool = False) -> list[S
         for (path, each), values in sample.items()
         if len(path) <= LONGEST and any(map(as_text, values))
     ]
-    if not fields:
-        return []
     is_csv = isinstance(tables, CsvFiles)
     by_values = by_values or is_csv and all(one.path.isdecimal() for one in fields)
     if by_values:
@@ -462,12 +460,11 @@ def _wide(fields: Sequence[Field]) -> list[Suggestion]:
             )
             what = "TDOA" if len(names) == 2 else "range"
             unit, why = _length(f"median {what}", replace(group[0], values=_values(group)))
-            why += [
-                "A column for each; a value that repeats the last one of its column is left out.",
-                *([SIGN] if len(names) == 2 else []),
-            ]
+            why.append(
+                "A column for each; a value that repeats the last one of its column is left out."
+            )
             columns = {**dict(zip(names, names)), what.lower(): pattern + tail + unit}
-            return [Suggestion(columns, comments=why)]
+            return [Suggestion(columns, comments=why + [SIGN] * (what == "TDOA"))]
     return []
 
 

@@ -105,7 +105,7 @@ class Foreign:
         return table
 
     def recorded_anchors(self) -> Any:
-        """Return the anchors in a bag (`bags.topics.Recorded`), or None. Raises InputError."""
+        """Return the anchors in a bag (`bags.bag.Recorded`), or None. Raises InputError."""
 
     def blocks(self, wanted: Sequence[Wanted]) -> Iterator[Block]:
         """Yield the records of tables. Raises InputError for a field that a table lacks."""
@@ -182,10 +182,7 @@ class CsvTable:
             yield block
 
     def place_of(self, name: str) -> int:
-        """Return the place of a column. Raises InputError unless it is there once."""
-        if name not in self.names:
-            listed = ", ".join(self.names)
-            raise InputError(f"{self._path}: has no column {name!r}; its columns are {listed}.")
+        """Return the place of a column. Raises InputError if it is there twice."""
         if self.names.count(name) > 1:
             raise InputError(
                 f"{self._path}: column {name!r} is there twice; every column must be there once."
