@@ -85,20 +85,22 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _replay(args: argparse.Namespace) -> int:
-    from ..live.replay import ACKNOWLEDGE_LIMIT, replay
+    from ..live.replay import ACKNOWLEDGE_LIMIT, ReplayOptions, replay
 
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,
-        rate=args.rate,
-        loop=args.loop,
-        clock_rate=args.clock,
-        wait=args.wait_matched,
-        wait_topics=args.wait_topics,
-        follow=args.follow,
-        ros_arguments=args.ros_arguments,
-        packages=args.package,
-        say=say,
+        ReplayOptions(
+            args.rate,
+            args.loop,
+            args.clock,
+            args.wait_matched,
+            args.wait_topics,
+            args.follow,
+            args.ros_arguments,
+            args.package,
+        ),
+        say,
     )
     played = done.played
     for topic, count in sorted(played.counts.items()):

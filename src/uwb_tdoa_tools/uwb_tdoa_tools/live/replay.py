@@ -689,6 +689,40 @@ DISCOVERY = 2.0  # s without a new subscription after which the present ones suf
 
 
 @dataclass(frozen=True)
+class ReplayOptions:
+    """Options of a replay.
+
+    Attributes
+    ----------
+    rate : float
+        Times as fast as recorded.
+    loop : bool
+        Start again at the end.
+    clock_rate : float or None
+        Hz of /clock.
+    wait : float
+        s until a subscription must exist.
+    wait_topics : sequence of str
+        Topics that each need a subscription.
+    follow : str or None
+        Topic to keep in step with. The TDOAs of the bag then need a subscription.
+    ros_arguments : sequence of str
+        Command line with --ros-args.
+    packages : sequence of str
+        Further packages of message types to import.
+    """
+
+    rate: float = 1.0
+    loop: bool = False
+    clock_rate: float | None = None
+    wait: float = WAIT
+    wait_topics: Sequence[str] = ()
+    follow: str | None = None
+    ros_arguments: Sequence[str] = ()
+    packages: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
 class Replayed:
     """Result of a replay.
 
@@ -714,16 +748,7 @@ class Replayed:
 
 
 def replay(
-    bag: str | Path,
-    rate: float = 1.0,
-    loop: bool = False,
-    clock_rate: float | None = None,
-    wait: float = WAIT,
-    wait_topics: Sequence[str] = (),
-    follow: str | None = None,
-    ros_arguments: Sequence[str] = (),
-    packages: Sequence[str] = (),
-    say: Callable[[str], object] = print,
+    bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print
 ) -> Replayed:
     """Replay a bag over ROS topics.
 
@@ -731,22 +756,8 @@ def replay(
     ----------
     bag : path
         The bag.
-    rate : float
-        Times as fast as recorded.
-    loop : bool
-        Start again at the end.
-    clock_rate : float or None
-        Hz of /clock.
-    wait : float
-        s until a subscription must exist.
-    wait_topics : sequence of str
-        Topics that each need a subscription.
-    follow : str or None
-        Topic to keep in step with. The TDOAs of the bag then need a subscription.
-    ros_arguments : sequence of str
-        Command line with --ros-args.
-    packages : sequence of str
-        Further packages of message types to import.
+    options : ReplayOptions
+        How to replay it.
     say : callable
         Called with sentences about the progress.
 
@@ -759,30 +770,32 @@ def replay(
     InputError
         If the bag has no message, or nobody subscribes in time.
     """
-    with open_bag(bag) as reader, session("replay", list(ros_arguments)) as (node, stop):
-        publishers = _publishers(node, bag, reader, say, packages)
+    with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
+        publishers = _publishers(node, bag, reader, say, options.packages)
         connections = [
             connection for connection in reader.connections if connection.topic in publishers
         ]
         if not any(connection.msgcount for connection in connections):
             raise InputError(f"{bag}: has no message to replay.")
-        _wait_for_listeners(node, publishers, wait, wait_topics, follow, stop, say)
+        _wait_for_listeners(node, publishers, options, stop, say)
         wait_for_names(node)
         _leave_out_anchors(node, publishers, say)
         _remark_imu(node, publishers, connections, bag, say)
         connections = [each for each in connections if each.topic in publishers]
         count = sum(connection.msgcount for connection in connections)
         length = (reader.end_time - reader.start_time) / 1e9
-        tell = partial(_tell_progress, length, follow, say)
-        player = Player(node, publishers, rate, clock_rate, stop, tell)
-        nodes = Nodes(node, say) if follow else None
-        player.follower = Follower(node, follow, nodes) if follow and nodes else None
-        say(f"playing {count} messages, {length:.1f} s at rate {rate:g}")
+        tell = partial(_tell_progress, length, options.follow, say)
+        player = Player(node, publishers, options.rate, options.clock_rate, stop, tell)
+        nodes = Nodes(node, say) if options.follow else None
+        player.follower = (
+            Follower(node, options.follow, nodes) if options.follow and nodes else None
+        )
+        say(f"playing {count} messages, {length:.1f} s at rate {options.rate:g}")
         began = time.perf_counter()
         while not stop:
             with closing(read_ahead(reader.messages(connections))) as recorded:
                 player.play(recorded)
-            if not loop:
+            if not options.loop:
                 break
         took = time.perf_counter() - began
         acknowledged = _wait_acknowledged(publishers.values(), ACKNOWLEDGE_LIMIT, stop)
@@ -842,25 +855,23 @@ def _publishers(
 def _wait_for_listeners(
     node: Node,
     publishers: dict[str, Publisher],
-    wait: float,
-    wait_topics: Sequence[str],
-    follow: str | None,
+    options: ReplayOptions,
     stop: Stop,
     say: Callable[[str], object],
 ) -> None:
     """Wait until each wanted topic has a subscription, and the followed topic a publisher.
 
-    Wanted are `wait_topics`. Else all topics of the bag are wanted, and those
+    Wanted are the topics that the options name. Else all topics of the bag are wanted, and those
     with a subscription suffice once no further one has come for DISCOVERY s.
 
     Raises
     ------
     InputError
-        If after `wait` s a required topic, or every topic, has no subscription.
+        If after `options.wait` s a required topic, or every topic, has no subscription.
     """
-    needed = [f"/{topic.lstrip('/')}" for topic in wait_topics]
+    needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
     wanted = needed or list(publishers)
-    if follow and not needed:
+    if options.follow and not needed:
         needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
     missing = [topic for topic in wanted if topic not in publishers]
     if missing:
@@ -868,32 +879,36 @@ def _wait_for_listeners(
             f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}."
         )
     names = ", ".join(publishers[topic].topic_name for topic in wanted)
-    say(f"waiting up to {wait:g} s for subscriptions to {names}")
+    say(f"waiting up to {options.wait:g} s for subscriptions to {names}")
     began = changed = time.monotonic()
     missing = wanted
-    heard: tuple[tuple[int, ...], ...] = ()
+    heard: list[tuple[int, int]] = []
     while not stop:
         now = time.monotonic()
-        counts = tuple(publishers[topic].get_subscription_count() for topic in wanted)
-        known = tuple(node.count_subscribers(publishers[topic].topic_name) for topic in wanted)
-        followed = not follow or node.count_publishers(node.resolve_topic_name(follow))
-        missing = [topic for topic, count in zip(wanted, counts) if not count]
-        if (counts, known) != heard:
-            heard, changed = (counts, known), now
+        ends = [  # subscriptions of each topic that get its messages, and all
+            (publisher.get_subscription_count(), node.count_subscribers(publisher.topic_name))
+            for publisher in (publishers[topic] for topic in wanted)
+        ]
+        followed = not options.follow or node.count_publishers(
+            node.resolve_topic_name(options.follow)
+        )
+        missing = [topic for topic, (count, _) in zip(wanted, ends) if not count]
+        if ends != heard:
+            heard, changed = ends, now
         enough = not missing or (
             now > changed + DISCOVERY
             and len(missing) < len(wanted)
             and not set(missing) & set(needed)
         )
-        matched = all(count >= there for count, there in zip(counts, known))
-        if (enough and followed and matched) or now > began + wait:
+        matched = all(count >= there for count, there in ends)
+        if (enough and followed and matched) or now > began + options.wait:
             break
         time.sleep(0.01)
     unheard = [publishers[topic].topic_name for topic in missing if topic in needed]
     if not stop and (unheard or len(missing) == len(wanted)):
         what = unheard[0] if unheard else "any topic of the bag"
         raise InputError(
-            f"nobody subscribes to {what} within {wait:g} s; start the nodes first, "
+            f"nobody subscribes to {what} within {options.wait:g} s; start the nodes first, "
             "or wait longer "
             "(--wait-matched)."
         )
