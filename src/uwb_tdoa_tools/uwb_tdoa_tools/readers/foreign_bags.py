@@ -116,7 +116,7 @@ class ForeignBag(Foreign):
         messages = [message for _, _, message in islice(self._messages({table}), most)]
         # an array may be empty in the first
         found: dict[tuple[str, str], list[Any]] = {
-            key: [] for message in messages for key in message.paths()
+            key: [] for message in messages for key in _paths(message.content, "", "")
         }
         for message in messages:
             for (path, each), values in found.items():
@@ -190,19 +190,16 @@ class Message:
 
     Attributes
     ----------
+    content : the message, as rosbags gives it.
     is_stamped : whether the message has a stamp.
     """
 
     def __init__(self, content: Any, received: int) -> None:
-        self._content = content
+        self.content = content
         stamp: Any = getattr(getattr(content, "header", content), "stamp", None)
         in_header = stamp.sec * 10**9 + stamp.nanosec if hasattr(stamp, "nanosec") else 0
         self.is_stamped = in_header != 0
         self._times = {RECEIVED: received / 1e9, STAMP: (in_header or received) / 1e9}
-
-    def paths(self) -> list[tuple[str, str]]:
-        """Return [(path of a number, text or stamp, the array that it lies in, or "")]."""
-        return [*_paths(self._content, "", "")]
 
     def rows(self, each: str) -> Sequence[int | None]:
         """Return the places in the array at a path; [None] for the message itself. Raises KeyError."""
@@ -230,7 +227,7 @@ class Message:
         return value
 
     def _value(self, steps: Path_, index: int | None) -> Any:
-        value = self._content
+        value = self.content
         for step in steps:
             try:
                 if isinstance(step, int):
@@ -247,7 +244,10 @@ def _empty_block(number: int, one: Wanted) -> Block:
 
 
 def _paths(value: Any, path: str, each: str) -> Iterator[tuple[str, str]]:
-    """Yield the paths of the fields below a path, of arrays by their first entry."""
+    """Yield (path of a number, text or stamp, the array that it lies in, or "") below a path.
+
+    Arrays are looked at by their first entry.
+    """
     if hasattr(value, "__msgtype__"):
         for name in value.__dataclass_fields__:
             if not name.startswith("__"):

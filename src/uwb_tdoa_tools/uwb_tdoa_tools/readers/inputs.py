@@ -63,33 +63,27 @@ def find_flights(
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
     """Return the survey of a recording; None for a bag that keeps its own anchors.
 
-    The choice for a bag is printed once.
+    The choice for bags is printed on stderr, once per survey and process; None stands for surveys that
+    do not fit.
     """
     if survey is None or not is_bag(path):
         return survey_for(path, survey)
     try:
         its_survey = survey_for(path, survey)
+        sentence = (
+            f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so "
+            "in every bag that is read with it."
+        )
     except InputError:
-        _report_once(
+        its_survey = None
+        sentence = (
             f"{path}: no survey in {survey} fits; the anchors that it holds count, as in "
             "other bags that none fits."
         )
-        return None
-    _report_once(
-        (
-            f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so "
-            "in every bag that is read with it."
-        ),
-        its_survey,
-    )
-    return its_survey
-
-
-def _report_once(sentence: str, about: str | Path | None = None) -> None:
-    """Print a sentence on stderr once per survey and process; None stands for surveys that do not fit."""
-    if about not in _REPORTED:
-        _REPORTED.add(about)
+    if its_survey not in _REPORTED:
+        _REPORTED.add(its_survey)
         tqdm.write(printable(sentence), file=sys.stderr)
+    return its_survey
 
 
 def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None:

@@ -276,8 +276,11 @@ def _refuse_lines_above(path: Path) -> None:
 def _fits(name: str, tables: Foreign, streams: set[str]) -> bool:
     """Return whether a shipped profile finds one of some streams."""
     wanted = {column for stream in streams for column in STREAMS[stream]}
-    sources = [source for source in load_profile(name).sources if wanted & {*source.columns}]
-    return any(_has(tables, table, source) for table in tables.types for source in sources)
+    return any(
+        wanted & {*source.columns} and _has(tables, table, source)
+        for source in load_profile(name).sources
+        for table in tables.types
+    )
 
 
 def _has(tables: Foreign, table: str, source: Source) -> bool:
