@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from studies import moved_anchors, plans, situations
 from studies.any_path import Path, between
 from studies.healthy import healthy
-from uwb_tdoa_tools.checking.check import processed_streams
+from uwb_tdoa_tools.checking.check import check, processed_streams
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.planning.maps import TOO_FEW
 from uwb_tdoa_tools.planning.precision import FixedNoise, RadioNoise
@@ -127,3 +127,20 @@ def test_only_a_gyroscope_in_degrees_is_named_while_a_tilted_quadrotor_turns(uni
     flight = healthy("quadrotor, TDOA3", 8008)  # 2 rad/s, and a large radius
     recording = of_flight(flight.replaced(imu=replace(flight.imu, gyro=unit * flight.imu.gyro)))
     assert {one.rule for one in processed_streams(recording).findings()} == named
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "anchor"), [(1000, 3), (1006, 6)])
+def test_one_anchor_that_explains_nearly_as_much_as_delays_of_all_is_named(seed, anchor):
+    """It was "the survey does not fit", although the anchor costs 0.37 m."""
+    changed = moved_anchors.recorded("moved before", seed)[2]
+    found = check(of_flight(replace(changed, truth=None))).findings
+    assert found[0].cause.startswith(f"anchor {anchor} ") and len(found) == 1
+
+
+@pytest.mark.slow
+def test_a_sound_imu_outside_of_the_anchors_is_not_of_another_body():
+    flight = healthy(
+        "outside of its anchors", 9806
+    )  # worse by 5 % with it, and by 0.6 standard errors
+    assert not [one for one in check(of_flight(flight)).findings if one.severity == "error"]
