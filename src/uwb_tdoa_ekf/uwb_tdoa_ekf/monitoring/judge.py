@@ -127,7 +127,7 @@ class Judge:
         for k, one in enumerate(self._hypotheses):
             positions = one.positions(self._anchors.positions)
             signed = -d if one.kind == SIGN else d
-            losses[k] = locate(positions, rows, signed, STARTS, places[k])
+            losses[k] = locate(positions[rows], signed, STARTS, places[k])
         self._losses.append(losses)
         self._places.append(places)
 
@@ -312,9 +312,7 @@ def _hypotheses(doubtful: Sequence[int]) -> list[Hypothesis]:
 
 
 @compiled
-def locate(
-    positions: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
-) -> float:
+def locate(ends: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray) -> float:
     """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
 
     The search is a robust Gauss-Newton iteration from several starts, during which the scale of the
@@ -322,10 +320,8 @@ def locate(
 
     Parameters
     ----------
-    positions : (N, 3) array
-        Anchor positions, in m.
-    rows : (k, 2) int array
-        Rows of both anchors of each TDOA.
+    ends : (k, 2, 3) array
+        Positions of both anchors of each TDOA, in m.
     d : (k,) array
         TDOAs, in m.
     starts : (s, 3) array
@@ -333,14 +329,9 @@ def locate(
     place : (3,) array
         Filled with the best position, in m.
     """
-    n = len(d)
-    # ends: positions of both anchors of each TDOA; low, high: corners of the room around them
-    ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
-    for i in range(n):
-        for side in range(2):
-            for j in range(3):
-                ends[i, side, j] = positions[rows[i, side], j]
-                low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
+    n, low, high = len(d), np.empty(3), np.empty(3)
+    for j in range(3):  # corners of the room around the anchors
+        low[j], high[j] = ends[:, :, j].min(), ends[:, :, j].max()
     size = math.sqrt(np.sum((high - low) ** 2))
     least, p, gradient = np.inf, np.empty(3), np.empty(3)
     normal = np.empty((3, 4))  # normal equations, the right side in the last column
