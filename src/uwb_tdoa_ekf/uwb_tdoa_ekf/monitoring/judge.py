@@ -4,15 +4,17 @@
 
 TDOAs that are heard together are a snapshot. It locates the tag under every hypothesis: as it is,
 with the other sign, with another scale of the survey or of one anchor, and with two anchors
-exchanged. All hypotheses compete on the same snapshots. A mistake is named if it beats every rival.
+exchanged. A whole recording also has the order of ids that explains it best. All hypotheses compete
+on the same snapshots. A mistake is named if it beats every rival.
 A rival of a survey in another unit is the radio, whose errors depend on the place, as behind a body.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from itertools import combinations
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import combinations, permutations, product
 import math
 from typing import NamedTuple
 
@@ -25,6 +27,7 @@ from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 from ..core.ground import solve
 from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding
+from .swap import Piece, best_order
 
 # most pairs of a snapshot; fewest anchors: three coordinates and a scale need four differences
 PAIRS, HEARD = (32, 5)
@@ -33,6 +36,14 @@ SMALL = 0.05  # m, median size of TDOAs below which they are not in metres thems
 FEWEST, MANY, KEPT = (4, 10, 20)
 # most anchors for tests of each anchor and of each pair; it limits the work
 SINGLE = 12
+# An order of more than two ids must leave less than CLEARER of the loss of the best other hypothesis.
+# Each wrong id must explain EACH of the loss, or all together if they are counted from another one: in
+# a nearly symmetrical room several orders leave up to 3 % less than the right one.
+CLEARER, EACH = 0.95, 0.008
+# snapshots on which orders of ids are compared, to find some and to choose; orders that are improved;
+# places, in half sizes of the room, from which the search begins
+COMPARED, IMPROVED = (12, 60), 3
+PLACES = np.array(list(product((-0.6, 0.0, 0.6), (-0.6, 0.0, 0.6), (-0.5, 0.5))))
 # smallest factor, ratio of successive factors, largest factor
 SMALLEST, RATIO, LARGEST = (1.5, 1.25, 1500.0)
 # number of Gauss-Newton steps; longest step relative to the room
@@ -61,6 +72,9 @@ NANOSECONDS = SPEED_OF_LIGHT / 1e9
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
+Snapshot = tuple[np.ndarray, np.ndarray]  # rows of both anchors (k, 2), and TDOAs (k,) m
+
+
 class Hypothesis(NamedTuple):
     """A mistake of the survey, or of the TDOAs.
 
@@ -73,23 +87,23 @@ class Hypothesis(NamedTuple):
     factor : float
         Factor by which all anchors, or one (ALONE), are too far from the origin.
     rows : tuple of int
-        Row of that anchor, or of both (EXCHANGED).
+        Row of that anchor, or of those with another id (EXCHANGED).
+    at : tuple of int
+        Rows at whose surveyed places these anchors are.
     """
 
     kind: int
     name: str = ""
     factor: float = 1.0
     rows: tuple[int, ...] = ()
+    at: tuple[int, ...] = ()
 
     def positions(self, surveyed: np.ndarray) -> np.ndarray:
-        """Return where the anchors are if the hypothesis is right, (N, 3) m.
-
-        EXCHANGED anchors have the factor 1, and the order of a single one is its own.
-        """
+        """Return where the anchors are if the hypothesis is right, (N, 3) m."""
         if not self.rows:
             return surveyed / self.factor
-        moved, rows = surveyed.copy(), list(self.rows)
-        moved[rows] = surveyed[rows[::-1]] / self.factor
+        moved = surveyed.copy()
+        moved[list(self.rows)] = surveyed[list(self.at)] / self.factor
         return moved
 
 
@@ -112,6 +126,7 @@ class Judge:
         """
         self._anchors = anchors
         self._hypotheses = _hypotheses(range(len(anchors)) if doubtful is None else doubtful)
+        self._snapshots: deque[Snapshot] = deque(maxlen=kept)
         self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
         self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
 
@@ -121,20 +136,63 @@ class Judge:
             return
         count = min(PAIRS, len(snapshot))
         some = snapshot[np.linspace(0, len(snapshot) - 1, count).round().astype(int)]
-        rows, d = some[:, :2].astype(np.int64), some[:, 2].copy()
-        losses = np.empty(len(self._hypotheses))
-        places = np.empty((len(self._hypotheses), 3))
-        for k, one in enumerate(self._hypotheses):
-            positions = one.positions(self._anchors.positions)
-            signed = -d if one.kind == SIGN else d
-            losses[k] = locate(positions[rows], signed, STARTS, places[k])
-        self._losses.append(losses)
-        self._places.append(places)
+        self._snapshots.append((some[:, :2].astype(np.int64), some[:, 2].copy()))
+        found = [self._located(one, *self._snapshots[-1]) for one in self._hypotheses]
+        self._losses.append(np.array([loss for loss, _ in found]))
+        self._places.append(np.array([place for _, place in found]))
+
+    def _located(
+        self, one: Hypothesis, rows: np.ndarray, d: np.ndarray
+    ) -> tuple[float, np.ndarray]:
+        """Return the loss of a Hypothesis on a snapshot, and the place of the tag (3,) m."""
+        place = np.empty(3)
+        ends = one.positions(self._anchors.positions)[rows]
+        return locate(ends, -d if one.kind == SIGN else d, STARTS, place), place
 
     def forget(self) -> None:
         """Drop all snapshots, because from now on the TDOAs differ."""
+        self._snapshots.clear()
         self._losses.clear()
         self._places.clear()
+
+    def add_order(self) -> None:
+        """Add the order of ids that explains all snapshots best to the hypotheses.
+
+        In flight the Monitor finds it sooner, by where the tag was before. Here the search begins at
+        places all over the room. The best orders are then improved by exchanges of two anchors.
+        """
+        surveyed = self._anchors.positions
+        if len(self._losses) < FEWEST or len(surveyed) > SINGLE or not self._best:
+            return
+        low, high = surveyed.min(axis=0), surveyed.max(axis=0)
+        across = np.maximum(high - low, THIN * np.linalg.norm(high - low))
+        few, many = (
+            [self._snapshots[k] for k in np.linspace(0, len(self._snapshots) - 1, n).astype(int)]
+            for n in COMPARED
+        )
+
+        def loss(order: tuple[int, ...], some: Sequence[Snapshot] = few) -> float:
+            one = _of_order(order)
+            left = np.mean([self._located(one, *each)[0] for each in some])
+            turned = len({(at - row) % len(order) for row, at in enumerate(order)}) == 1
+            return float(left) * (1.0 + EACH * (1 if turned else len(one.rows)))
+
+        found = set()
+        for rows, d in few[::2]:
+            for begin in 0.5 * (low + high) + 0.5 * PLACES * across:
+                piece = Piece(*rows.T, d, begin, begin)
+                found.add(tuple(best_order(surveyed, [piece])[0].tolist()))
+        likely = [tuple(range(len(surveyed))), *sorted(found, key=loss)[:IMPROVED]]
+        likely = {image for order in likely for image in _images(_improved(order, loss), surveyed)}
+        of_many = partial(loss, some=many)
+        best = _improved(min(likely, key=of_many), of_many)
+        one, others = _of_order(best), float(np.mean(self._losses, axis=0).min())
+        if len(one.rows) > 2 and of_many(best) < CLEARER * others:
+            self._hypotheses.append(one)
+            for number, each in enumerate(self._snapshots):
+                left, place = self._located(one, *each)
+                self._losses[number] = np.append(self._losses[number], left)
+                self._places[number] = np.vstack([self._places[number], place])
 
     @property
     def full(self) -> bool:
@@ -153,17 +211,17 @@ class Judge:
         evidence = f"{in_words(left, z)}, in {len(own)} snapshots"
         if found.kind == SIGN:
             return wrong_sign(evidence, left)
-        ids = self._anchors.ids[list(found.rows)].tolist()
         if found.kind == EXCHANGED:
-            return exchanged({ids[0]: ids[1], ids[1]: ids[0]}, evidence)
+            return exchanged(self.order, evidence)
         if found.kind == ALONE:
+            number = self._anchors.ids[found.rows[0]]
             return Finding(
                 "anchor_scale",
                 ERROR,
-                cause=f"the position of anchor {ids[0]} is in {found.name}, not in metres",
+                cause=f"the position of anchor {number} is in {found.name}, not in metres",
                 evidence=evidence,
                 remedy=(
-                    f"{ids[0]}: {{position: [x, y, z]}}  # what is there now, divided by "
+                    f"{number}: {{position: [x, y, z]}}  # what is there now, divided by "
                     f"{found.factor:.6g}"
                 ),
                 value=found.factor,
@@ -174,17 +232,25 @@ class Judge:
         return wrong_scale(named.name, named.factor, evidence)
 
     @property
-    def exchange(self) -> tuple[int, ...]:
-        """Return the rows of the anchors whose exchange explains more than any other mistake, or ()."""
-        best = int(np.argmin(np.mean(self._losses, axis=0))) if self._losses else 0
-        found = self._hypotheses[best]
-        return found.rows if found.kind == EXCHANGED else ()
+    def order(self) -> dict[int, int]:
+        """Return {id as received: id of that anchor} if other ids explain more than any mistake, or {}."""
+        found = self._hypotheses[self._best] if self._losses else Hypothesis(AS_IT_IS)
+        rows, at = (
+            self._anchors.ids[list(some)].tolist() if found.kind == EXCHANGED else []
+            for some in (found.rows, found.at)
+        )
+        return dict(zip(rows, at))
+
+    @property
+    def _best(self) -> int:
+        """Return the number of the hypothesis that leaves least; 0 is the survey as it is."""
+        return int(np.argmin(np.mean(self._losses, axis=0)))
 
     def _named(self) -> int | None:
         """Return the number of the hypothesis of a mistake that beats every rival, or None."""
         if len(self._losses) < FEWEST:
             return None
-        best = int(np.argmin(np.mean(self._losses, axis=0)))
+        best = self._best
         kind = self._hypotheses[best].kind
         if kind == AS_IT_IS or not self._beats(best):
             return None
@@ -306,9 +372,44 @@ def _hypotheses(doubtful: Sequence[int]) -> list[Hypothesis]:
     made += [Hypothesis(SCALED, name, factor) for name, factor in UNITS.items()]
     if len(doubtful) <= SINGLE:
         for row in doubtful:
-            made += [Hypothesis(ALONE, name, factor, (row,)) for name, factor in UNITS.items()]
-        made += [Hypothesis(EXCHANGED, rows=rows) for rows in combinations(doubtful, 2)]
+            made += [Hypothesis(ALONE, name, by, (row,), (row,)) for name, by in UNITS.items()]
+        made += [
+            Hypothesis(EXCHANGED, rows=rows, at=rows[::-1]) for rows in combinations(doubtful, 2)
+        ]
     return made
+
+
+def _of_order(order: Sequence[int]) -> Hypothesis:
+    """Return the Hypothesis that anchor k is at the place of order[k]."""
+    rows = tuple(row for row, at in enumerate(order) if row != at)
+    return Hypothesis(EXCHANGED, rows=rows, at=tuple(order[row] for row in rows))
+
+
+def _images(order: tuple[int, ...], surveyed: np.ndarray) -> list[tuple[int, ...]]:
+    """Return the orders that a nearly symmetrical room hardly distinguishes from `order`.
+
+    surveyed : (N, 3) places of the anchors, in m
+    """
+    off, images = surveyed - 0.5 * (surveyed.min(axis=0) + surveyed.max(axis=0)), [order]
+    for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
+        away = np.linalg.norm((off[:, list(axes)] * signs)[:, None] - off, axis=2)
+        nearest = away.argmin(axis=1)
+        if len(set(nearest.tolist())) == len(surveyed):
+            images.append(tuple(nearest[list(order)].tolist()))
+    return images
+
+
+def _improved(order: tuple[int, ...], loss: Callable[[tuple[int, ...]], float]) -> tuple[int, ...]:
+    """Return an order that no exchange of two anchors improves, from `order` on."""
+    least, better = loss(order), order
+    while better:
+        order, better = better, ()
+        for one, other in combinations(range(len(order)), 2):
+            trial = [*order]
+            trial[one], trial[other] = order[other], order[one]
+            if (left := loss(tuple(trial))) < least:
+                least, better = left, tuple(trial)
+    return order
 
 
 @compiled

@@ -137,6 +137,7 @@ class StreamRules:
             self._keep(self.imu, imu_window(*self._imu.rest()))
         if len(self._tdoa) >= FULL:
             self._add_tdoa(*self._tdoa.rest())
+        self.judge.add_order()
 
     def findings(self, latest: int = 0) -> list[Finding]:
         """Return the Findings that hold, the most severe first.

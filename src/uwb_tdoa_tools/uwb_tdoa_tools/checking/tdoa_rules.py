@@ -125,16 +125,14 @@ def successive_difference(tdoa: Tdoas) -> float:
 
 
 def judged(recording: OrderedRecording) -> Iterator[Trial]:
-    """Yield the trials with the other sign, and with the two ids exchanged that the Judge prefers.
+    """Yield the trials with the other sign, and with the other ids that the Judge prefers.
 
     Ids are not tried for motion along a line: in a room that is symmetrical about it, anchors differ
     by their systematic errors alone.
     """
     yield Trial(recording.with_tdoa(d=-recording.tdoa.d), wrong_sign(""))
-    rows = judge_of(recording).exchange
-    if rows and second_principal_std(recording.survey_fit.places) >= LEAST_MOTION:
-        one, two = recording.anchors.ids[list(rows)].tolist()
-        table = {one: two, two: one}
+    table = judge_of(recording).order
+    if table and second_principal_std(recording.survey_fit.places) >= LEAST_MOTION:
         yield Trial(relabelled(recording, table), exchanged(table, ""))
 
 
@@ -147,6 +145,7 @@ def judge_of(recording: OrderedRecording) -> Judge:
     streams.judge = Judge(brief.anchors, None, doubtful)
     tdoa = brief.tdoa
     streams.feed_tdoa(tdoa.t, np.full(len(tdoa), np.nan), tdoa.a, tdoa.b, tdoa.d)
+    streams.finish()
     return streams.judge
 
 
