@@ -103,25 +103,8 @@ NEEDLESS = 0.85
 MOVED = 0.3  # m, standard deviation of positions in motion; measured flights 1.2 at least
 TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
-# Surveys whose z is not up: what z is, the remedy, and the matrix behind the positions that undoes it.
-SURVEYS = (
-    (
-        "is upside down: z points down",
-        "y, x, -z  # of every anchor; in a profile: world: ned",
-        np.diag([1.0, -1.0, -1.0]),
-    ),
-    (
-        "has y up, not z",
-        "x, -z, y  # of every anchor",
-        np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
-    ),
-    (
-        "has y down, and z is not up",
-        "x, z, -y  # of every anchor",
-        np.eye(3)[[0, 2, 1]] * [1.0, 1.0, -1.0],
-    ),
-    ("has y up, not z, and left-handed axes", "x, z, y  # of every anchor", np.eye(3)[[0, 2, 1]]),
-)
+# Axes of a survey that may point up, as (number of the axis, sign, whether the survey is mirrored)
+UPWARDS = [up for up in product(range(3), (1, -1), (False, True)) if up != (2, 1, False)]
 NEARLY = 2.0 * TIE  # a second fault, e.g. a useless gyroscope, may explain a little more
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
@@ -249,28 +232,48 @@ def _turned_survey(base: Unexplained, recording: OrderedRecording, most: float) 
     """Return the Finding that z of the survey is not up, or None.
 
     Systems that survey their own anchors lay the plane z = 0 through three of them, not on the
-    floor. Motion capture and game engines have y up.
+    floor. Motion capture and game engines have y up. A mirror image with z up is a rival here, which
+    the arrangements of the IMU name.
 
     most : largest ratio of the losses that may remain
     """
-    places = recording.anchors.positions
-    better = []
-    for axes, positions, matrix in SURVEYS:
-        turned = replace(recording, anchors=recording.anchors.at(places @ matrix))
-        ratio, z = compare(base, turned.unexplained(RATIO * base.mean, LEANING))
+    places, better = recording.anchors.positions, []
+    for up in UPWARDS:
+        turned = recording.anchors.at(places @ _upright(*up).T)
+        ratio, z = compare(
+            base, replace(recording, anchors=turned).unexplained(RATIO * base.mean, LEANING)
+        )
         if ratio < most and z > DEVIATIONS:
-            better.append((ratio, z, axes, positions))
-    if not better:
+            better.append((ratio, z, up, np.median(turned.positions[:, 2])))
+    alike = [one for one in better if one[0] < min(better)[0] + TIE]
+    if not alike:
         return None
-    ratio, z, axes, positions = min(better)
+    # level motion does not tell what is up from what is down, but anchors are above the floor
+    ratio, z, (axis, sign, mirrored), _ = max(alike, key=lambda one: one[3])
+    if (axis, sign) == (2, 1):
+        return None
+    name, where = "xyz"[axis], "up" if sign > 0 else "down"
+    axes = ", and its axes are left-handed" * mirrored
+    turn = ", ".join(map(signed_axis, _upright(axis, sign, mirrored)))
     return Finding(
         "survey_upside_down",
         ERROR,
-        cause=f"the survey {axes}, and the inertial sensor measures where up is",
+        cause=(
+            f"{name} of the survey points {where}{axes}: the inertial sensor measures where up is"
+        ),
         evidence=in_words(ratio, z),
-        remedy=f"x, y, z = {positions}",
+        remedy=f"x, y, z = {turn}  # of every anchor"
+        + "; in a profile: world: ned" * ((axis, sign, mirrored) == (2, -1, False)),
         value=ratio,
     )
+
+
+def _upright(axis: int, sign: int, mirrored: bool) -> np.ndarray:
+    """Return the matrix (3, 3) that turns an axis of a survey up, or down, and mirrors it or not."""
+    others = [(axis + 1) % 3, (axis + 2) % 3]
+    if mirrored != (sign < 0):
+        others.reverse()
+    return np.eye(3)[[*others, axis]] * [[1.0], [1.0], [sign]]
 
 
 def has_moved(places: np.ndarray) -> bool:
