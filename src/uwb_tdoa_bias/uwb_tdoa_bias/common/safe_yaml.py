@@ -43,7 +43,8 @@ def read_yaml(path: str | Path) -> Any:
 def parse_yaml(data: bytes | str, name: str | Path, float_texts: bool = False) -> Any:
     """Return the content of YAML text or bytes, as `read_yaml`.
 
-    name : for messages; float_texts : return a number that is not whole as text: an id 1E10 is none
+    name : for messages; float_texts : return a number that is not whole, and yes or no, as text: an id
+    1E10 is no number, and the anchor NO is in the north-east of a German hall
     """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
@@ -130,8 +131,8 @@ class _Loader(_Base):
                     key_node.start_mark,
                     "a list or mapping is used as a key; use a text or a number.",
                 )
-            is_float = key_node.tag == f"{_TAG}float"  # 1E10 is a name
-            key = key_node.value if is_float else self.construct_object(key_node)
+            is_text = key_node.tag in (f"{_TAG}float", f"{_TAG}bool")  # 1E10 and NO are names
+            key = key_node.value if is_text else self.construct_object(key_node)
             if key in content:
                 raise _Refused(key_node.start_mark, f"{key_node.value!r} is there twice; keep one.")
             content[key] = self.construct_object(value_node, deep)
@@ -152,6 +153,9 @@ class _Loader(_Base):
             raise _Refused(node.start_mark, f"{node.value[:40]} is not finite; give a number.")
         return node.value if self._float_texts else value
 
+    def construct_yaml_bool(self, node: ScalarNode) -> bool | str:
+        return node.value if self._float_texts else super().construct_yaml_bool(node)
+
 
 _TAG = "tag:yaml.org,2002:"
 _IMPLICIT = {
@@ -171,3 +175,4 @@ for _name, (_pattern, _first) in _IMPLICIT.items():
     _Loader.add_implicit_resolver(_TAG + _name, re.compile(f"^(?:{_pattern})$"), list(_first))
 _Loader.add_constructor(_TAG + "int", _Loader.construct_yaml_int)
 _Loader.add_constructor(_TAG + "float", _Loader.construct_yaml_float)
+_Loader.add_constructor(_TAG + "bool", _Loader.construct_yaml_bool)

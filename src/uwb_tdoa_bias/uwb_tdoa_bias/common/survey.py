@@ -70,7 +70,7 @@ _UNIT = re.compile(rf"^(.*?)[ (\[]+({'|'.join(filter(None, LENGTHS))})[)\]]?$")
 _UNIT_KEY = re.compile(r"(?:(?:length|distance|position|coordinate|coordinates)[ _-]?)?units?")
 _UNIT_COMMENT = re.compile(r"^\s*#.*?\bunits?\s*[:=]\W*(\w*)", re.IGNORECASE | re.MULTILINE)
 _NUMBERED = re.compile(
-    r"^(?:anchor|anc|a|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
+    r"^(?:anchor|anc|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
     re.IGNORECASE,
 )
 _COMMA = re.compile(r"^[-+]?[0-9]+,[0-9]+$")
@@ -130,10 +130,14 @@ class NamedAnchors:
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Return the Anchors of a survey whose names are ids, see `read_named_anchors`. Raise InputError."""
+    """Return the Anchors of a survey whose names are ids, see `read_named_anchors`. Raise InputError.
+
+    The name A1 counts as the id 1.
+    """
     named = read_named_anchors(path)
-    for name in named.ids:
-        raise InputError(f"{path}: id is {name[:40]!r}; it must be a whole number.")
+    for name, number in named.ids.items():
+        if _decimal(re.sub("^a[ _-]?", "", name, flags=re.IGNORECASE)) != str(number):
+            raise InputError(f"{path}: id is {name[:40]!r}; it must be a whole number.")
     return named.anchors
 
 

@@ -251,7 +251,7 @@ def survey_below_zero(view: CoverageView) -> Iterator[Finding]:
             WARNING,
             cause="all anchors are below zero: z seems to point down in the survey",
             evidence=f"heights from {z.min():.2f} to {z.max():.2f} m",
-            remedy="x, y, z = y, x, -z  # of every anchor",
+            remedy="x, y, z = y, x, -z  # of every anchor; x, y, -z if y is left of x",
             value=float(z.max()),
         )
 

@@ -105,6 +105,7 @@ TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
 # Axes of a survey that may point up, as (number of the axis, sign, whether the survey is mirrored)
 UPWARDS = [up for up in product(range(3), (1, -1), (False, True)) if up != (2, 1, False)]
+BELOW = -0.05  # m, height of the highest anchor below which all are below the floor
 NEARLY = 2.0 * TIE  # a second fault, e.g. a useless gyroscope, may explain a little more
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
@@ -244,12 +245,13 @@ def _turned_survey(base: Unexplained, recording: OrderedRecording, most: float) 
             base, replace(recording, anchors=turned).unexplained(RATIO * base.mean, LEANING)
         )
         if ratio < most and z > DEVIATIONS:
-            better.append((ratio, z, up, np.median(turned.positions[:, 2])))
-    alike = [one for one in better if one[0] < min(better)[0] + TIE]
-    if not alike:
+            below = turned.positions[:, 2].max() < BELOW
+            better.append((below, up[2], ratio, z, up))
+    if not better:
         return None
-    # level motion does not tell what is up from what is down, but anchors are above the floor
-    ratio, z, (axis, sign, mirrored), _ = max(alike, key=lambda one: one[3])
+    # Level motion does not tell what is up from what is down, but anchors are above the floor.
+    least = min(ratio for _, _, ratio, _, _ in better)
+    _, _, ratio, z, (axis, sign, mirrored) = min(one for one in better if one[2] < least + TIE)
     if (axis, sign) == (2, 1):
         return None
     name, where = "xyz"[axis], "up" if sign > 0 else "down"
