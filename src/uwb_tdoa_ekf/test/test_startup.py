@@ -9,7 +9,7 @@ import math
 from covariances import assert_covariance
 from driving import assert_sound, drive, errors as distances_off, state_for
 import flights
-from flights import GRAVITY, Wave, corners, fly, position_at
+from flights import GRAVITY, Wave, corners, fly, position_at, with_sensors
 from hypothesis import given, strategies as st
 from live import assert_same, assert_same_as_offline, feed
 import numpy as np
@@ -598,12 +598,12 @@ def test_a_tag_at_rest_doubts_nothing():
 
 def test_evidence_is_the_likelihood_ratio_of_each_angle():
     doubt = new_state(np.zeros((4, 3))).record.yaw_test
-    assert accumulate(doubt, 1.0) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
+    assert accumulate(doubt, False) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
     # innovations of a yaw error of 270 degrees
     turn = np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])
     for _ in range(2):
         doubt.information[:], doubt.vector[:] = 0.1 * np.eye(2), 0.1 * turn
-        accumulate(doubt, 1.0)
+        accumulate(doubt, False)
     assert not doubt.vector.any() and not doubt.information.any()
     assert np.degrees(ANGLES[np.argmax(doubt.ratios)]) == pytest.approx(270.0)
     assert np.max(doubt.ratios) == pytest.approx(2 * 0.5 * 0.1 * 2.0)
@@ -612,9 +612,41 @@ def test_evidence_is_the_likelihood_ratio_of_each_angle():
 def test_a_moment_of_evidence_counts_little_and_evidence_for_the_yaw_is_no_credit():
     doubt = new_state(np.zeros((4, 3))).record.yaw_test
     doubt.information[:] = 1e3 * np.eye(2)  # the yaw is right
-    assert accumulate(doubt, 1.0) == 0.0
+    assert accumulate(doubt, False) == 0.0
     doubt.information[:], doubt.vector[:] = 0.5 * np.eye(2), [-1.0, 0.0]
-    assert accumulate(doubt, 1.0) == MOST_AT_ONCE
+    assert accumulate(doubt, False) == MOST_AT_ONCE
+
+
+def test_a_velocity_of_a_wrong_scale_is_no_evidence_for_a_yaw_error():
+    doubt = new_state(np.zeros((4, 3))).record.yaw_test
+    for measured, left in ((False, 1.0), (True, 0.9)):
+        doubt.ratios[:] = 1.0
+        # innovations of a tag that rests while its sensor reports a velocity
+        doubt.information[:], doubt.vector[:] = 0.2 * np.eye(2), [-0.2, 0.0]
+        assert accumulate(doubt, measured) == pytest.approx(left)
+
+
+def with_velocity(flight, scale=1.0):
+    """Return a flight of `fly` with a velocity sensor that reports `scale` times the velocity."""
+    velocity = with_sensors(flight).velocity
+    return flight.replaced(velocity=replace(velocity, v=scale * velocity.v))
+
+
+@pytest.mark.parametrize(("seed", "wrong"), [(0, 60.0), (1, -90.0), (2, 180.0)])
+def test_a_wrong_yaw_is_doubted_soon_where_a_velocity_is_measured(seed, wrong):
+    flight = with_velocity(fly(seed, 10.0, tdoa_std=0.05, **QUIET))
+    odometry, stamps = opened(Estimator(flight.anchors, told(flight, math.radians(wrong))), flight)
+    assert stamps and stamps[0] < 1.5, stamps
+    assert not dishonest(flight, odometry)[odometry.t > stamps[0] + 0.3].any()
+
+
+@pytest.mark.parametrize(
+    ("scale", "given"), [(0.7, True), (1.15, True), (1.0, True), (0.7, False), (1.3, False)]
+)
+def test_a_right_yaw_is_not_doubted_where_a_velocity_is_measured(scale, given):
+    flight = with_velocity(fly(1, 20.0, tdoa_std=0.05, outliers=0.05, **QUIET), scale)
+    config = told(flight, math.radians(8.0)) if given else FilterConfig()
+    assert not opened(Estimator(flight.anchors, config), flight)[1]
 
 
 def test_a_measured_start_on_the_floor_is_not_above_the_anchors(shared_data):

@@ -322,7 +322,7 @@ def _prepare(
         window = initialization.recent(ekf, velocity.SECONDS)
         angle = velocity.compare_path(ekf, anchors, window, parameters.tdoa_std, t)
         if angle != 0.0:
-            initialization.turn_yaw(ekf, angle, records)
+            initialization.turn_yaw(ekf, parameters, angle, records)
     ekf.tdoa_rate += 1.0 - min(1.0, t - ekf.last_tdoa) * ekf.tdoa_rate
     if t >= ekf.next_workspace:
         initialization.update_workspace(ekf, anchors, parameters, t)
@@ -487,7 +487,7 @@ def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> No
     tilt. Then the tag counts as level.
     """
     wheels = ekf.velocity
-    driven = velocity.drives(wheels, ekf.t)
+    driven = velocity.agrees(wheels, ekf.t, velocity.HELD)
     alike = 2.0 * velocity.CORRELATION_TIME
     turn_psd = parameters.turn_noise**2
     yaw_psd = alike * wheels.yaw_rate_variance if driven else turn_psd

@@ -432,7 +432,7 @@ def set_pose(
             hypotheses.set_state(hypothesis, x, covariance)
             if has_yaw:
                 turn_about_vertical(hypothesis.x, pose.yaw - yaw_of(hypothesis.x))
-                yaw_check.forget(ekf.yaw_test)
+                yaw_check.forget(ekf.yaw_test, True)
                 hypotheses.set_yaw_variance(hypothesis, pose.yaw_std**2)
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
@@ -492,7 +492,7 @@ def _begin(
             P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
             P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2
     ekf.best = 0
-    yaw_check.forget(ekf.yaw_test)
+    yaw_check.forget(ekf.yaw_test, not unknown)
     noise.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.last_agreement = t
     ekf.consistency = 1.0
@@ -547,7 +547,7 @@ def recover(
         _reopen(ekf, cost)
     elif share < CLEARLY_MORE + explained:
         return
-    wheels = velocity.agrees(ekf.velocity, t)
+    wheels = velocity.agrees(ekf.velocity, t, velocity.SLIP)
     # an IMU shows how far the tag can be only if the yaw is known
     felt = (
         parameters.use_imu
@@ -709,18 +709,12 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def turn_yaw(ekf: Record, angle: float, history: np.ndarray) -> None:
+def turn_yaw(ekf: Record, parameters: Record, angle: float, history: np.ndarray) -> None:
     """Turn the yaw by an angle, rad, because TDOAs and the path of wheels show that it is wrong."""
-    best = ekf.hypotheses[ekf.best]
-    turn_about_vertical(best.x, angle)
-    for h in range(HYPOTHESES):
-        if h != ekf.best:
-            ekf.hypotheses[h].log_weight = -np.inf
-    hypotheses.set_yaw_variance(best, hypotheses.YAW_STD**2)
-    yaw_check.forget(ekf.yaw_test)
+    turn_about_vertical(ekf.hypotheses[ekf.best].x, angle)
     ekf.yaw_test.count += 1
-    ekf.attitude_reset = True
     widen(ekf, history)
+    reset_attitude(ekf, parameters, hypotheses.YAW_STD, history)
 
 
 @compiled

@@ -197,6 +197,8 @@ YAW_TEST = _record(
     ("information", float, (2, 2)),  # upper triangle of its matrix
     ("alone", bool),  # a single hypothesis is left
     ("ratios", float, YAW_ERRORS),  # log likelihood ratio of each yaw error to none
+    # s of motion in which velocities must agree until they confirm a given yaw; not above 0: confirmed
+    ("unconfirmed", float),
     ("next_look", float),  # s, stamp of the next test
     ("count", int),  # number of times that the yaw was opened again
     ("opened", float),  # s, stamp of the last time

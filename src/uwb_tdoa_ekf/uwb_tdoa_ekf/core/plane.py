@@ -50,7 +50,9 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
     """
     ekf.next_floor = t + CONSTRAINT_PERIOD
     innovation, R, std = ekf.innovation, ekf.transition.rotation, parameters.fixed_height_std
-    rolls = parameters.non_holonomic_std > 0.0 and (ekf.sensed or velocity.drives(ekf.velocity, t))
+    rolls = parameters.non_holonomic_std > 0.0 and (
+        ekf.sensed or velocity.agrees(ekf.velocity, t, velocity.HELD)
+    )
     alike = 2.0 * velocity.CORRELATION_TIME / CONSTRAINT_PERIOD
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]

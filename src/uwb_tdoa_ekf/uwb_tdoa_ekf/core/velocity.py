@@ -22,7 +22,7 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
-from . import ground
+from . import ground, yaw_check
 from .height import STUCK_TIME
 from .history import add_update
 from .hypotheses import add_log_likelihood, alive
@@ -45,6 +45,7 @@ YAW_RATE, GYRO_BIAS = (3, 14)
 SLIP = 2.0  # s for which disagreeing wheels may slip
 HELD = 0.5  # s for which the last velocity of wheels drives the prediction
 STANDING = 0.1  # factor on the standard deviations of wheels that do not turn at all
+MOVING = 0.3  # m/s; a faster velocity that is used confirms the yaw
 # Hz, sample rate of a gyroscope: the noise of a sample is gyro_noise * sqrt(GYRO_RATE)
 GYRO_RATE = 100.0
 # s of a path that is compared with TDOAs, their least number, and s between two comparisons
@@ -97,13 +98,18 @@ def observe(
     disagrees = state.nis > (AGREES if state.refused else DISAGREES)
     state.refused = disagrees or stuck or state.contradicted
     residual.weight, residual.verdict = 0.0, REJECTED
-    if state.refused or worst > GATE**2:
+    used = not (state.refused or worst > GATE**2)
+    doubt = ekf.yaw_test
+    if used:
+        residual.weight, residual.verdict = 1.0, USED
+        if np.sum(sensor.value[:2] ** 2) > MOVING**2:
+            doubt.unconfirmed -= dt
+        if of_wheels:
+            state.agreed, state.yaw_rate = sensor.t, sensor.value[YAW_RATE]
+            state.yaw_rate_variance = sensor.std[YAW_RATE] ** 2
+            state.speed_variance = sensor.std[0] ** 2 if sensor.std[0] <= LONGEST_STD else 0.0
+    elif not (doubt.alone and doubt.unconfirmed > 0.0):
         return
-    residual.weight, residual.verdict = 1.0, USED
-    if of_wheels:
-        state.agreed, state.yaw_rate = sensor.t, sensor.value[YAW_RATE]
-        state.yaw_rate_variance = sensor.std[YAW_RATE] ** 2
-        state.speed_variance = sensor.std[0] ** 2 if sensor.std[0] <= LONGEST_STD else 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
@@ -119,12 +125,16 @@ def observe(
                 ekf.transition.rotation,
                 innovation,
             )
-            add_log_likelihood(hypothesis, innovation, inflation)
-            w = kalman_robust(hypothesis, innovation, 1.0 if leads else inflation, GATE)
-            add_update(ekf, h, sensor.t, records)
-            if h == ekf.best:
-                residual.weight = min(residual.weight, w)
-        if of_wheels and ekf.sensed:
+            innovation.weight = 0.0
+            if used:
+                add_log_likelihood(hypothesis, innovation, inflation)
+                w = kalman_robust(hypothesis, innovation, 1.0 if leads else inflation, GATE)
+                add_update(ekf, h, sensor.t, records)
+                if h == ekf.best:
+                    residual.weight = min(residual.weight, w)
+            if doubt.alone:
+                _test_yaw(ekf, sensor, axis, inflation)
+        if used and of_wheels and ekf.sensed:
             _compare_yaw_rate(hypothesis, sensor, ekf.imu, innovation)
             innovation.prior_variance += GYRO_RATE * parameters.gyro_noise**2
             kalman_robust(hypothesis, innovation, inflation, GATE)
@@ -132,18 +142,12 @@ def observe(
 
 
 @compiled
-def drives(state: Record, t: float) -> bool:
-    """Return whether wheels, by their VELOCITY state, drive the prediction at stamp t (s)."""
-    return not state.refused and t - state.agreed < HELD
+def agrees(state: Record, t: float, seconds: float) -> bool:
+    """Return whether wheels, by their VELOCITY state, have agreed within `seconds` before stamp t (s).
 
-
-@compiled
-def agrees(state: Record, t: float) -> bool:
-    """Return whether wheels, by their VELOCITY state, have agreed lately at stamp t (s).
-
-    Slip ends within SLIP seconds, so older agreement does not count.
+    Within HELD they drive the prediction. Slip ends within SLIP, so older agreement does not count.
     """
-    return not state.refused and t - state.agreed < SLIP
+    return not state.refused and t - state.agreed < seconds
 
 
 @compiled
@@ -173,16 +177,20 @@ def _extend_path(ekf: Record, sensor: Record) -> None:
     carry(state, sensor.t, state.pose)
     if sensor.t - state.path_until > HELD or sensor.std[0] > LONGEST_STD:
         state.path_since = sensor.t
-    state.path_until, state.path_velocity[:] = sensor.t, 0.0
+    state.path_until = sensor.t
     rotation(x[6], x[7], x[8], x[9], R)
     c, s = math.cos(yaw_of(x)), math.sin(yaw_of(x))
-    for axis in range(3):
-        u = sensor.value[axis] if sensor.std[axis] <= LONGEST_STD else 0.0
-        state.path_velocity[0] += u * (c * R[0, axis] + s * R[1, axis])
-        state.path_velocity[1] += u * (c * R[1, axis] - s * R[0, axis])
-        state.path_velocity[2] += R[2, axis] * (ekf.imu.gyro[axis] - x[13 + axis])
-    if not ekf.sensed:
-        state.path_velocity[2] = sensor.value[YAW_RATE]
+    vx, vy = _horizontal(R, sensor)
+    state.path_velocity[0], state.path_velocity[1] = c * vx + s * vy, c * vy - s * vx
+    state.path_velocity[2] = (
+        np.sum(R[2] * (ekf.imu.gyro - x[13:])) if ekf.sensed else sensor.value[YAW_RATE]
+    )
+
+
+@compiled
+def _horizontal(R: np.ndarray, sensor: Record) -> tuple[float, float]:
+    """Return the velocity of a SENSOR_ROW along x and y of the world, m/s; R turns body to world."""
+    return np.sum(R[0] * sensor.value[:3]), np.sum(R[1] * sensor.value[:3])
 
 
 @compiled
@@ -232,7 +240,7 @@ def compare_path(
         return 0.0
     contradicted = least - free > (0.5 if state.contradicted else 1.0) * needed
     away = math.hypot(np.sum(fit[:3]) - x[0], np.sum(fit[3:6]) - x[1])
-    if contradicted and not state.contradicted and agrees(state, t) and away > LED:
+    if contradicted and not state.contradicted and agrees(state, t, SLIP) and away > LED:
         ekf.distrusted = True
     state.contradicted = contradicted
     heading = yaw_of(x) - window[n - 1].pose[2]
@@ -291,21 +299,14 @@ def _complete(sensor: Record, parameters: Record) -> None:
 
     The reduction by STANDING applies to wheels that do not turn.
     """
-    for axis in range(3):
-        if sensor.std[axis] == 0.0:
-            sensor.std[axis] = parameters.velocity_std
+    sensor.std[:3] = np.where(sensor.std[:3] == 0.0, parameters.velocity_std, sensor.std[:3])
     if sensor.std[YAW_RATE] == 0.0:
         sensor.std[YAW_RATE] = (
             parameters.yaw_rate_std if parameters.yaw_rate_std > 0.0 else 2.0 * LONGEST_STD
         )
-    if sensor.std[YAW_RATE] > LONGEST_STD:
+    if sensor.std[YAW_RATE] > LONGEST_STD or np.any(sensor.value != 0.0):
         return
-    for axis in range(4):
-        if sensor.value[axis] != 0.0:
-            return
-    for axis in range(4):
-        if sensor.std[axis] <= LONGEST_STD:
-            sensor.std[axis] *= STANDING
+    sensor.std[:] = np.where(sensor.std <= LONGEST_STD, STANDING * sensor.std, sensor.std)
 
 
 @compiled
@@ -329,20 +330,19 @@ def _worst(ekf: Record, sensor: Record, residual: Record) -> float:
     """
     innovation, worst = ekf.innovation, -1.0
     for axis in range(3):
-        if sensor.std[axis] > LONGEST_STD:
-            continue
-        compare(
-            ekf.hypotheses[ekf.best],
-            sensor.value[axis],
-            sensor.std[axis],
-            axis,
-            ekf.transition.rotation,
-            innovation,
-        )
-        total = innovation.prior_variance + innovation.noise_variance
-        nis = innovation.value**2 / total
-        if nis > worst:
-            worst, residual.innovation, residual.variance = nis, innovation.value, total
+        if sensor.std[axis] <= LONGEST_STD:
+            compare(
+                ekf.hypotheses[ekf.best],
+                sensor.value[axis],
+                sensor.std[axis],
+                axis,
+                ekf.transition.rotation,
+                innovation,
+            )
+            total = innovation.prior_variance + innovation.noise_variance
+            nis = innovation.value**2 / total
+            if nis > worst:
+                worst, residual.innovation, residual.variance = nis, innovation.value, total
     return worst
 
 
@@ -381,6 +381,18 @@ def compare(
     innovation.value = value - u
     innovation.noise_variance = std**2
     project(hypothesis.P, innovation)
+
+
+@compiled
+def _test_yaw(ekf: Record, sensor: Record, axis: int, inflation: float) -> None:
+    """Update the test of the yaw with the innovation of one axis of a SENSOR_ROW.
+
+    A yaw error turns the measured velocity in the world frame.
+    """
+    R = ekf.transition.rotation
+    vx, vy = _horizontal(R, sensor)
+    x, y = R[0, axis], R[1, axis]
+    yaw_check.observe(ekf, inflation, True, -x * vx - y * vy, x * vy - y * vx)
 
 
 @compiled

@@ -7,7 +7,8 @@ in cos(psi) - 1 and sin(psi). The predictions and updates of the filter propagat
 responses of the error state. They give the log likelihood ratio of each yaw error to none
 (Willsky and Jones, IEEE Trans. Automatic Control 1976). Its sum over time never falls below zero
 (Page, Biometrika 1954): a yaw that was right for long is doubted as soon as one that was just
-given. The test changes the filter only if the evidence suffices.
+given. A yaw error turns measured velocities, too. Less evidence is needed against a given yaw that
+velocities have not confirmed yet. The test changes the filter only if the evidence suffices.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from .state import CHECK_PERIOD, ERROR_STATES, propagate_vector
 from .update import GATE
 
 YAW_KNOWN = math.radians(20.0)  # rad, standard deviation below which the yaw counts as known
-# Log likelihood ratio above which the yaw is opened again, and most of it that the innovations of
-# CHECK_PERIOD can add, unless a quarter of it is more. Both trade false alarms against late detection:
-# a moment of bad TDOAs must not suffice. See docs/notebook/reliability.md for the ratios of 22 measured flights.
-EVIDENCE, MOST_AT_ONCE = (6.0, 0.4)
-# s over which evidence counts while velocities are used. Their scale looks like a yaw, so three times the
-# evidence is needed then.
-MEMORY = 6.0
+# Log likelihood ratio above which the yaw is opened again, the same of a given yaw that velocities have
+# not confirmed, and most of it that the innovations of CHECK_PERIOD can add, unless a quarter of it is
+# more. All trade false alarms against late detection: a moment of bad TDOAs must not suffice. See
+# docs/notebook/reliability.md for the ratios of 22 measured flights.
+EVIDENCE, UNCONFIRMED_EVIDENCE, MOST_AT_ONCE = (6.0, 1.6, 0.4)
+CONFIRMED = 4.0  # s of motion with velocities that agree, after which a given yaw is confirmed
+HEARD = 1.0  # s after the last velocity in which a wrong velocity may explain innovations
 ANGLES = math.pi * np.arange(3, 3 + YAW_ERRORS) / 12.0  # rad, yaw errors to test: 45 to 315 degrees
 COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))  # the error of the state is linear in both
 
@@ -41,12 +42,16 @@ def clear(doubt: Record) -> None:
 
 
 @compiled
-def forget(doubt: Record) -> None:
-    """Clear a YAW_TEST, because the yaw was replaced."""
+def forget(doubt: Record, given: bool) -> None:
+    """Clear a YAW_TEST, because the yaw was replaced.
+
+    given is whether nothing but the user, or an earlier filter, gives the new yaw.
+    """
     clear(doubt)
     doubt.vector[:] = 0.0
     doubt.information[:] = 0.0
     doubt.ratios[:] = 0.0
+    doubt.unconfirmed = CONFIRMED if given else 0.0
 
 
 @compiled
@@ -68,7 +73,9 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
 
 @compiled
-def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
+def observe(
+    ekf: Record, correlation_length: float, shows: bool, cosine: float = 0.0, sine: float = 0.0
+) -> None:
     """Update the test with the innovation of the best hypothesis, after its Kalman update.
 
     Parameters
@@ -79,10 +86,11 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
         Number of measurements that count as a single independent one, see update.py.
     shows : bool
         Whether the innovation is evidence. Otherwise only the responses follow the update.
+    cosine, sine : float
+        Responses of the measurement itself, besides those of the state.
     """
     doubt, innovation = ekf.yaw_test, ekf.innovation
     to_cosine, to_sine = doubt.response[0], doubt.response[1]
-    cosine = sine = 0.0
     for n in range(innovation.entries):
         cosine += innovation.row[n] * to_cosine[innovation.states[n]]
         sine += innovation.row[n] * to_sine[innovation.states[n]]
@@ -106,20 +114,21 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
 
 
 @compiled
-def accumulate(doubt: Record, kept: float) -> float:
+def accumulate(doubt: Record, measured: bool) -> float:
     """Add recent innovations to the log likelihood ratio of each yaw error; return the largest.
 
-    kept is the share, 0 to 1, of the earlier evidence that still counts.
+    measured is whether a sensor measures velocities. Their scale may be wrong, down to meaningless: a yaw
+    error must explain the innovations better than that.
     """
     v, J = doubt.vector, doubt.information
+    scale = min(1.0, max(-1.0, v[0] / J[0, 0])) if measured and J[0, 0] > 0.0 else 0.0
+    other = scale * (v[0] - 0.5 * scale * J[0, 0])
     for k in range(len(ANGLES)):
         c, s = COSINES[k], SINES[k]
         gained = (
             c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1])
-        )
-        doubt.ratios[k] = max(
-            0.0, kept * doubt.ratios[k] + min(gained, max(MOST_AT_ONCE, 0.25 * gained))
-        )
+        ) - other
+        doubt.ratios[k] = max(0.0, doubt.ratios[k] + min(gained, max(MOST_AT_ONCE, 0.25 * gained)))
     v[:] = 0.0
     J[:] = 0.0
     return float(np.max(doubt.ratios))
@@ -135,10 +144,11 @@ def contradicts(ekf: Record, t: float) -> bool:
     if t < doubt.next_look:
         return False
     doubt.next_look = t + CHECK_PERIOD
-    measured = t - ekf.velocity.heard < MEMORY and not ekf.velocity.refused
-    kept, needed = (1.0 - CHECK_PERIOD / MEMORY, 3.0 * EVIDENCE) if measured else (1.0, EVIDENCE)
+    measured = t - ekf.velocity.heard < HEARD
+    unconfirmed = measured and doubt.unconfirmed > 0.0
     return (
-        accumulate(doubt, kept) > needed and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
+        accumulate(doubt, measured) > (UNCONFIRMED_EVIDENCE if unconfirmed else EVIDENCE)
+        and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
     )
 
 
