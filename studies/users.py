@@ -64,6 +64,8 @@ LINE, CLIPPED, FIXED = "oblique line", "clipped gyroscope", "fixed height"
 SHARE = 0.023  # of the samples of a gyroscope, beyond its range
 CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("rest", 0, 10, "white"),
+    ("rest", 0, 10, "delays"),
+    ("rest", 0, 200, "white"),
     ("rest", 100, 50, "delays"),
     ("person", 0, 2, "white"),
     ("person", 0, 10, "delays"),

@@ -56,8 +56,10 @@ from uwb_tdoa_ekf.core.update import (
 from uwb_tdoa_ekf.core.workspace import (
     SMALLEST as WORKSPACE_SMALLEST,
     STD as WORKSPACE_STD,
+    add_circle,
     admits,
     constrain,
+    listen,
     set_bounds,
 )
 from uwb_tdoa_ekf.offline import run_offline
@@ -1006,3 +1008,57 @@ def test_coast_is_constant_velocity(seed):
     np.testing.assert_allclose(after, phi @ P @ phi.T + Q, atol=1e-7 * np.abs(P).max())
     assert_covariance(after)
     np.testing.assert_array_equal(after, after.T)
+
+
+def sits_then_walks(rate, tdoa_outliers=0.0):
+    """A tag without an IMU that sits for a minute, then walks with up to 1 m/s: estimates and truth."""
+    rng, t = np.random.default_rng(7), np.arange(0.0, 80.0, 1.0 / rate)
+    since, anchors = np.maximum(t - 60.0, 0.0), corners()
+    way = np.where(since < 1.0, 0.5 * since**2, since - 0.5)
+    p = np.column_stack([2.5 + 1.4 * np.sin(way / 1.4), 3.0 + 0.05 * way, np.full(len(t), 1.2)])
+    a = rng.integers(0, 8, len(t))
+    b = (a + rng.integers(1, 8, len(t))) % 8
+    distance = np.linalg.norm(p[:, None] - anchors.positions, axis=2)
+    d = distance[range(len(t)), b] - distance[range(len(t)), a] + 0.1 * rng.normal(size=len(t))
+    d += np.where(rng.random(len(t)) < tdoa_outliers, rng.uniform(-3.0, 3.0, len(t)), 0.0)
+    flight = Flight("sits", anchors, Tdoas(t, anchors.ids[a], anchors.ids[b], d))
+    odometry = run_offline(flight, FilterConfig(use_imu=False)).odometry
+    true = np.column_stack([np.interp(odometry.t, t, column) for column in p.T])
+    return odometry, np.linalg.norm(odometry.p - true, axis=1)
+
+
+@pytest.mark.parametrize(
+    ("rate", "tdoa_outliers", "still"),
+    [(10.0, 0.0, 0.08), (10.0, 0.03, 0.11), (50.0, 0.0, 0.04), (200.0, 0.0, 0.03)],
+)
+def test_a_tag_without_imu_averages_at_rest_and_its_next_steps_are_followed(
+    rate, tdoa_outliers, still
+):
+    odometry, off = sits_then_walks(rate, tdoa_outliers)
+    sits = (odometry.t > 10.0) & (odometry.t < 60.0)
+    assert np.sqrt(np.mean(off[sits] ** 2)) < still
+    assert np.linalg.norm(np.diff(odometry.p[sits], axis=0), axis=1).sum() < 10.0
+    assert off[odometry.t > 60.0].max() < 1.5
+    walks = odometry.t > 64.0
+    assert np.sqrt(np.mean(off[walks] ** 2)) < 0.4
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.6])
+def test_anchors_on_any_line_leave_the_circle_around_it_open(slope):
+    x = np.linspace(-4.0, 4.0, 8)
+    state = new_state(np.column_stack([x, slope * x, np.full(8, 2.8)]))
+    ekf, window = state.record, np.zeros(7, TDOA)
+    window["a"], window["b"] = np.arange(7), np.arange(1, 8)
+    listen(ekf, window, state.anchors, 100.0, 0)
+    along = np.array([1.0, slope, 0.0]) / np.hypot(1.0, slope)
+    covariance = np.zeros((9, 9))
+    add_circle(ekf, False, np.array([0.0, 0.0, 0.8]), covariance)
+    # 2 m below the line: the tag may be anywhere on a circle of 2 m
+    level = np.array([-along[1], along[0], 0.0])
+    np.testing.assert_allclose(covariance[:3, :3] @ along, 0.0, atol=1e-9)
+    np.testing.assert_allclose(level @ covariance[:3, :3] @ level, 2.0)
+    np.testing.assert_allclose(covariance[2, 2], 6.0)
+    assert covariance[8, 8] > 3.0
+    bent = new_state(np.column_stack([x, 0.1 * x**2, np.full(8, 2.8)]))
+    listen(bent.record, window, bent.anchors, 100.0, 0)
+    assert not bent.record.line.any()

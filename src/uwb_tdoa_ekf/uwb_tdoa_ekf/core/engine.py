@@ -695,9 +695,9 @@ def _update_hypothesis(
         _reject(residual, innovation)
         if innovation.weight > 0.0:
             residual.weight, residual.verdict = innovation.weight, USED
-            if of_tdoa and parameters.adapt_noise and not ekf.sensed:
-                noise.learn_motion(ekf, t, innovation)
             history.add_update(ekf, h, t, records)
+            if of_tdoa and parameters.adapt_noise and not ekf.sensed:
+                noise.learn_motion(ekf, parameters, t, innovation)
 
 
 @compiled
@@ -744,8 +744,7 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
         squared += np.sum((ekf.rival - best.x[:3]) ** 2)
     if ekf.consistency < INCONSISTENT:
         squared += initialization.reach(ekf, t) ** 2
-    for k in range(3):
-        row.covariance[k, k] += squared
+    row.covariance[:3, :3] += squared * np.eye(3)
     _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)

@@ -304,24 +304,18 @@ def judge_motion(
     both, v = np.empty((3, 7)), np.zeros(3)
     for _sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
-        for k in range(3):
-            both[k, k], both[k, 3 + k] = 1.0 / SPEED**2, 1.0
+        both[:, :3], both[:, 3:6] = np.eye(3) / SPEED**2, np.eye(3)
         for k in range(n):
             row = changes[k]
             r = row[3] - row[0] * v[0] - row[1] * v[1] - row[2] * v[2]
             weight = 1.0 / (row[4] * (1.0 + r * r / (STILL_SCALE**2 * row[4])))
-            for i in range(3):
-                for j in range(3):
-                    both[i, j] += weight * row[i] * row[j]
-                both[i, 6] += weight * row[i] * row[3]
+            both[:, :3] += np.outer(weight * row[:3], row[:3])
+            both[:, 6] += weight * row[:3] * row[3]
         information = both[:, :3].copy()
         solve(both)
         v[:] = both[:, 6]
     covariance[:, :] = both[:, 3:6]
-    size = 0.0
-    for i in range(3):
-        for j in range(3):
-            size += v[i] * information[i, j] * v[j]
+    size = np.sum(np.outer(v, v) * information)
     if size >= MOVING:
         return MOVES
     return STILL if covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2 else UNKNOWN
@@ -421,11 +415,7 @@ def _equations(
     share (m). system is (n, n + 1). errors is (k, 2), in m: expected error of an anchor that is not
     late, and its standard deviation.
     """
-    pairs = evidence.pairs
-    anchors = evidence.anchors
-    workspace = evidence.workspace
-    prior = evidence.prior
-    parameters = evidence.parameters
+    pairs, anchors, workspace, prior, parameters = evidence
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0

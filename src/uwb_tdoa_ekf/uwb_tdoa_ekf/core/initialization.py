@@ -27,6 +27,7 @@ from .history import add_reset
 from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
 from .startup import APART, Places, inliers, level, locate, room_for, split
 from .state import CHECK_PERIOD, GRAVITY, turn_about_vertical, yaw_of
+from .workspace import ANY_YAW
 
 MINIMUM = 12  # least number of TDOAs for a search
 AGREE, AGREE_RECOVERY = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
@@ -45,7 +46,6 @@ UNKNOWN, BETTER = (2.0, 0.5)
 # just been switched on.
 LONGEST_GAP = 0.6
 TILT_STD = 0.1  # rad, roll and pitch at the start
-ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of a yaw that is uniform on the circle
 # rad, standard deviation with which hypotheses of all yaws start, with nearly the same weight
 YAW_SEARCH_STD = 2.0 * math.pi
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
@@ -406,10 +406,9 @@ def set_pose(
         covariance[:, :] = best.P[:6, :6]
     else:
         workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
-        for k in range(3):
-            x[k] = 0.5 * (ekf.workspace[0, k] + ekf.workspace[1, k])
-            covariance[k, k] = (0.5 * (ekf.workspace[1, k] - ekf.workspace[0, k])) ** 2
-            covariance[3 + k, 3 + k] = SPEED**2
+        x[:3] = 0.5 * (ekf.workspace[0] + ekf.workspace[1])
+        covariance[:3, :3] = np.diag((0.5 * (ekf.workspace[1] - ekf.workspace[0])) ** 2)
+        covariance[3:, 3:] = SPEED**2 * np.eye(3)
     for k in range(3):
         if math.isnan(pose.p[k]):
             continue
@@ -672,10 +671,7 @@ def widen(ekf: Record, history: np.ndarray) -> None:
 
     Only TDOAs can show how large the error is.
     """
-    for h in range(HYPOTHESES):
-        for k in range(3):
-            ekf.hypotheses[h].P[k, k] += WRONG_POSITION**2
-            ekf.hypotheses[h].P[3 + k, 3 + k] += SPEED**2
+    noise.widen(ekf, WRONG_POSITION**2, SPEED**2)
     add_reset(ekf, ekf.t, history)
 
 
@@ -781,8 +777,5 @@ def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
     Each axis is weighted between the measurement and hovering.
     """
     inertial.weigh(imu, False, parameters)
-    accel = np.empty(3)
-    for k in range(3):
-        hovering = GRAVITY if k == 2 else 0.0
-        accel[k] = hovering + imu.accel_weight[k] * (imu.mean_accel[k] - hovering)
-    return accel
+    hovering = np.array([0.0, 0.0, GRAVITY])
+    return hovering + imu.accel_weight * (imu.mean_accel - hovering)

@@ -254,6 +254,7 @@ EKF = _record(
     # 1.0 for axes along which the heard anchors share a coordinate, if the side of the tag is not
     # configured
     ("flat", float, 3),
+    ("line", float, 3),  # direction of heard anchors along a line; 0: they are not
     ("middle", float, 3),  # m, center of the anchors heard lately
     ("next_workspace", float),  # s, stamp of the next update of the workspace
     # 1/m^2, of the position, by a single TDOA of each anchor heard lately, see noise.py
@@ -267,6 +268,7 @@ EKF = _record(
     ("persistent", float),
     ("motion_ratio", float),  # power of the random acceleration over that of motion_noise
     ("velocity_change", float, 3),  # m/s, sum of recent corrections of the velocity
+    ("change_variance", float),  # m^2/s^2, of this sum if innovations are independent
     # s, stamp until which the tag may be anywhere, because its position was uncertain before
     ("position_unknown_until", float),
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search

@@ -34,9 +34,16 @@ FREE = 4
 LIMIT = 3.0  # standard deviations to which an innovation is limited for the share
 
 # Motion without inertial samples: step of the logarithm of its power for a TDOA, weight of the
-# likelihood, s over which corrections of the velocity are compared, bounds of the power over that of
-# motion_noise.
-STEP, OF_LIKELIHOOD, COMPARED, LEAST_POWER, MOST_POWER = (0.1, 0.5, 0.5, 0.01, 100.0)
+# likelihood, s over which corrections of the velocity are compared.
+STEP, OF_LIKELIHOOD, COMPARED = (0.1, 0.5, 0.5)
+# Bounds of the power over that of motion_noise: lower one at rest, lower one in motion, upper one.
+LEAST_AT_REST, LEAST_POWER, MOST_POWER = (1e-5, 0.01, 100.0)
+# Rest: normalized square of a velocity that is none, m/s and m, least speed and uncertainty of a tag
+# that is not known to rest.
+SIGNIFICANT, SLOW, PLACED = (9.0, 0.2, 1.0)
+# Begin of a motion: least number of corrections that count, standard deviations to which each is
+# limited, their sum squared over its variance that shows a motion, s for which the tag has moved then.
+COUNTED, LARGEST_CORRECTION, MOVED, BEGUN = (5.0, 4.0, 7.0, 0.6)
 LARGEST_NIS = 6.0  # normalized innovation squared; limits the effect of an outlier
 MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
 # s; limits the decay, because silence does not remove the information from anchors
@@ -148,36 +155,61 @@ def variance_inflation(ekf: Record, parameters: Record, t: float) -> float:
 
 
 @compiled
-def learn_motion(ekf: Record, t: float, innovation: Record) -> None:
+def learn_motion(ekf: Record, parameters: Record, t: float, innovation: Record) -> None:
     """Update motion_ratio of the EKF after an update without inertial samples.
 
     Corrections of the velocity are independent if the power of the random acceleration is right,
     alike if it is too small, and opposite if it is too large (Mehra, IEEE Trans. Automatic Control
-    1970). The likelihood of the innovation judges it where the prediction is uncertain.
+    1970). The likelihood of the innovation judges it where the prediction is uncertain. While the
+    velocity is zero within its deviation, the power falls, as fast as the filter averages: the
+    position of a tag at rest averages. If the recent corrections together are larger than their
+    deviation, the tag has begun to move, and the covariance grows as if it had done so BEGUN ago.
 
     Parameters
     ----------
     ekf : EKF
         State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
     t : float
         Stamp, s.
     innovation : INNOVATION
         Innovation after the update.
     """
-    before, kept = ekf.velocity_change, max(0.0, 1.0 - (t - ekf.last_tdoa) / COMPARED)
-    product = one = other = 0.0
-    for k in range(3):
-        change = innovation.cross_covariance[3 + k] * innovation.value / innovation.total_variance
-        product += change * before[k]
-        one += change * change
-        other += before[k] ** 2
-        before[k] = kept * before[k] + change
+    dt, recent = t - ekf.last_tdoa, ekf.velocity_change
+    kept = 1.0 - min(dt / COMPARED, 1.0 / COUNTED)
     prior = innovation.prior_variance
     total = prior + innovation.noise_variance * innovation.variance_inflation
+    alone = prior + parameters.tdoa_std**2 * ekf.noise_ratio
+    most = LARGEST_CORRECTION * math.sqrt(alone)
+    value = min(max(innovation.value, -most), most)
+    gain = innovation.cross_covariance[3:6] / total
+    alike = np.sum(gain * recent) * value
+    alike /= math.sqrt(np.sum((gain * value) ** 2) * np.sum(recent**2) + 1e-30)
+    recent[:] = kept * recent + gain * value
+    ekf.change_variance = kept**2 * ekf.change_variance + np.sum(gain**2) * alone
     slope = 0.5 * prior / total * (min(innovation.value**2 / total, LARGEST_NIS) - 1.0)
-    alike = product / math.sqrt(one * other + 1e-30)
     power = ekf.motion_ratio * math.exp(STEP * (alike + OF_LIKELIHOOD * slope))
-    ekf.motion_ratio = min(max(power, LEAST_POWER), MOST_POWER)
+    x, P = ekf.hypotheses[ekf.best].x, ekf.hypotheses[ekf.best].P
+    speed, place = np.sum(x[3:6] ** 2), P[0, 0] + P[1, 1] + P[2, 2]
+    if x[3] ** 2 / P[3, 3] + x[4] ** 2 / P[4, 4] + x[5] ** 2 / P[5, 5] > SIGNIFICANT:
+        power = max(power, LEAST_POWER)
+    elif speed < SLOW**2 and place < PLACED**2:
+        power *= math.exp(-dt * math.sqrt((P[3, 3] + P[4, 4] + P[5, 5]) / place))
+    if power < 1.0 and np.sum(recent**2) > MOVED * ekf.change_variance:
+        power, ekf.change_variance, recent[:] = 1.0, 0.0, 0.0
+        variance = BEGUN * parameters.motion_noise**2
+        widen(ekf, BEGUN**2 / 3.0 * variance, variance)
+    ekf.motion_ratio = min(max(power, LEAST_AT_REST), MOST_POWER)
+
+
+@compiled
+def widen(ekf: Record, of_position: float, of_velocity: float) -> None:
+    """Add variances to each axis of position, m^2, and velocity, m^2/s^2, of every hypothesis."""
+    for h in range(len(ekf.hypotheses)):
+        for k in range(3):
+            ekf.hypotheses[h].P[k, k] += of_position
+            ekf.hypotheses[h].P[3 + k, 3 + k] += of_velocity
 
 
 @compiled

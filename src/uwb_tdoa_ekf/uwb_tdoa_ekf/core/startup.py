@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, 
 
 from .ground import SPEED, KnownHeight, inverse, solve
 from .hypotheses import IMPROBABLE
-from .workspace import configured_side, reflect, rows_heard
+from .workspace import configured_side, principal_axis, reflect, rows_heard
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
 SWEEPS = 14  # Gauss-Newton steps per start
@@ -28,7 +28,6 @@ LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
 INLIER = 0.75  # m; a smaller residual agrees with a position
 NO_SCALE = 1e6  # m, scale of a loss that is quadratic in practice
 APART = 1.0  # m between two places; also the standard deviation above which a place is split
-SMALLEST = 1e-300  # m^2, replaces a variance of 0
 SPLIT = 0.8  # standard deviations from the middle of a place to each half after a split
 
 
@@ -96,9 +95,8 @@ def locate(
         age = max(0.0, window[len(window) - 1].t - window[i].t - parameters.start_window)
         ageing[i] = parameters.motion_noise**2 * age**3 / 3.0 / std**2
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
-    for k in range(3):
-        mean[k] = 0.5 * (workspace[0, k] + workspace[1, k])
-        prior_std[k] = 0.5 * (workspace[1, k] - workspace[0, k])
+    mean[:3] = 0.5 * (workspace[0] + workspace[1])
+    prior_std[:3] = 0.5 * (workspace[1] - workspace[0])
     if not math.isnan(height.z):
         mean[2], prior_std[2], prior_std[5] = height.z, height.std, SPEED
     prior_information = 1.0 / prior_std**2
@@ -154,17 +152,8 @@ def split(places: Places) -> None:
     nonlinear: its curvature depends on the distance to the anchors.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
-    axis, variance = np.empty(3), 0.0
-    # power iteration: at least one start is not normal to the principal axis
-    for start in range(3):
-        trial, its = np.zeros(3), 0.0
-        trial[start] = 1.0
-        for _ in range(30):
-            trial[:] = np.array([np.sum(covariance[0, i, :3] * trial) for i in range(3)])
-            its = math.sqrt(np.sum(trial**2))
-            trial /= max(its, SMALLEST)
-        if its > variance:
-            axis[:], variance = trial, its
+    axis = np.empty(3)
+    variance = principal_axis(covariance[0, :3, :3], axis)
     if cost[1] < np.inf or variance < APART**2:
         return
     step, cost[1] = np.empty(6), cost[0]
@@ -268,16 +257,13 @@ def _normal_equations(
     for i in range(n):
         tdoa = window[i]
         tau = tdoa.t - window[n - 1].t
-        for k in range(3):
-            p[k] = x[k] + tau * x[3 + k]
+        p[:] = x[:3] + tau * x[3:]
         r = tdoa.d - linearized_tdoa(p, anchors[tdoa.a].position, anchors[tdoa.b].position, row)
         if ageing[i] > 0.0:
             share = 1.0 / math.sqrt(1.0 + ageing[i] * (row[0] ** 2 + row[1] ** 2 + row[2] ** 2))
             r *= share
-            for k in range(3):
-                row[k] *= share
-        for k in range(3):
-            row[3 + k] = tau * row[k]
+            row[:3] *= share
+        row[3:] = tau * row[:3]
         residuals[i] = r
         w = weight(GEMAN_MCCLURE, r, scale)
         loss += geman_mcclure_loss(r, scale)

@@ -176,9 +176,7 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         x, P = hypothesis.x, hypothesis.P
         if not hypotheses.alive(hypothesis):
             continue
-        slow = True
-        for state in range(3, 6):
-            slow = slow and abs(x[state]) < SPEED_STD and P[state, state] < SPEED_STD**2
+        slow = np.abs(x[3:6]).max() < SPEED_STD and np.diag(P)[3:6].max() < SPEED_STD**2
         if not (slow or ekf.resting):
             continue
         for state in range(3, 6):
@@ -189,7 +187,5 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
 @compiled
 def _moves(hypothesis: Record, std: float) -> bool:
     """Return whether inertial samples contradict a velocity of zero within `std` (m/s)."""
-    for state in range(3, 6):
-        if hypothesis.x[state] ** 2 > GATE**2 * (hypothesis.P[state, state] + std**2):
-            return True
-    return False
+    limits = GATE**2 * (np.diag(hypothesis.P)[3:6] + std**2)
+    return (hypothesis.x[3:6] ** 2 > limits).any()

@@ -80,9 +80,8 @@ def weigh_explanations(
         Logarithm of the probability ratio of the ground to the given position.
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
-    for k in range(3):
-        prior[0, k] = 0.5 * (bounds[0, k] + bounds[1, k])
-        prior[1 + k, k] = 1.0 / (0.5 * (bounds[1, k] - bounds[0, k])) ** 2
+    prior[0] = 0.5 * (bounds[0] + bounds[1])
+    prior[1:] = np.diag(1.0 / (0.5 * (bounds[1] - bounds[0])) ** 2)
     evidence = Evidence(pairs, anchors, bounds, prior, parameters)
     starts, near = np.empty((4, 2)), _near_anchors(ekf, parameters)
     for start in range(4):
@@ -162,10 +161,8 @@ def _explanations(
                 cost[k], position[k], each[k] = c, trial, its
     cost[1 + ground.ALIKE] += UNUSUAL
     if known and not math.isnan(ekf.floor_place[0]):
-        for axis in range(2):
-            cost[1 + ground.KNOWN] += (
-                0.5 * ((position[1 + ground.KNOWN, axis] - ekf.floor_place[axis]) / REACH) ** 2
-            )
+        apart = (position[1 + ground.KNOWN, :2] - ekf.floor_place) / REACH
+        cost[1 + ground.KNOWN] += 0.5 * np.sum(apart**2)
     return Places(position, each, cost)
 
 
@@ -202,9 +199,7 @@ def set_at_rest(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) 
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
     covariance[3:, :] = 0.0
-    covariance[3:, 3:] = of_velocity
-    for k in range(3, 6):
-        covariance[k, k] += SPEED_STD**2
+    covariance[3:, 3:] = of_velocity + SPEED_STD**2 * np.eye(3)
 
 
 @compiled
@@ -262,9 +257,7 @@ def find_landed(
         still or _expected_late(pairs, anchors) > FEWEST_LATE
     ):
         return -1
-    prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
-    for k in range(3):
-        wide[k, k] += LANDING_STD[k] ** 2
+    prior, wide = np.empty((4, 3)), best.P[:3, :3] + np.diag(np.array(LANDING_STD) ** 2)
     prior[0], prior[1:] = best.x[:3], ground.inverse(wide)
     evidence = Evidence(pairs, anchors, ekf.workspace, prior, parameters)
     starts = best.x[:2].copy().reshape(1, 2)

@@ -23,6 +23,9 @@ SMALLEST = 3.0
 # determine the side of the tag.
 FLAT = 0.6
 BELOW, ABOVE = SIDES.index("below"), SIDES.index("above")
+STEEP = 0.7  # sine of the slope of a line of anchors that a known height does not tell apart from a mast
+ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of a yaw that is uniform on the circle
+SMALLEST_VARIANCE = 1e-300  # m^2, replaces a variance of 0
 STD = 1.0  # m, prior standard deviation about the bound for a tag just outside
 
 
@@ -65,9 +68,8 @@ def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
         Lower and upper bounds, m, world frame. Filled.
     """
     set_bounds(ekf.extent, margin, bounds)
-    for k in range(3):
-        bounds[0, k] = max(bounds[0, k], ekf.within[0, k])
-        bounds[1, k] = min(bounds[1, k], ekf.within[1, k])
+    bounds[0] = np.maximum(bounds[0], ekf.within[0])
+    bounds[1] = np.minimum(bounds[1], ekf.within[1])
     axis, sign, plane = ekf.side
     if sign > 0.0:
         bounds[0, int(axis)] = plane
@@ -154,7 +156,7 @@ def listen(
 
     The tag is within `reach` of each anchor heard. If two heard anchors are farther apart, the
     radio reaches at least that far, and their distance replaces `reach`. The function sets side,
-    middle, flat and within of the EKF.
+    middle, flat, line and within of the EKF.
 
     Parameters
     ----------
@@ -174,21 +176,48 @@ def listen(
     ekf.side[0], ekf.side[1], ekf.side[2] = side
     for i in range(len(rows)):
         for j in range(i):
-            one, other = anchors[rows[i]].position, anchors[rows[j]].position
-            square = (one[0] - other[0]) ** 2 + (one[1] - other[1]) ** 2 + (one[2] - other[2]) ** 2
-            reach = max(reach, math.sqrt(square))
+            apart = anchors[rows[i]].position - anchors[rows[j]].position
+            reach = max(reach, math.sqrt(np.sum(apart**2)))
     for k in range(3):
         low, high = _extent(rows, anchors, k)
         ekf.middle[k] = 0.5 * (low + high)
         ekf.flat[k] = 1.0 if high - low < FLAT and not (side[1] != 0.0 and k == side[0]) else 0.0
         ekf.within[0, k], ekf.within[1, k] = high - reach, low + reach
+    scatter, ekf.line[:] = np.zeros((3, 3)), 0.0
+    for row in rows:
+        away = anchors[row].position - ekf.middle
+        scatter += np.outer(away, away)
+    if side[1] == 0.0:
+        variance = principal_axis(scatter, ekf.line)
+        if np.trace(scatter) - variance > len(rows) * (0.5 * FLAT) ** 2:
+            ekf.line[:] = 0.0
+
+
+@compiled
+def principal_axis(covariance: np.ndarray, axis: np.ndarray) -> float:
+    """Compute the principal axis (3,) of a covariance (3, 3), and return its variance.
+
+    The method is power iteration: at least one start is not normal to the axis.
+    """
+    variance = 0.0
+    for start in range(3):
+        trial, its = np.zeros(3), 0.0
+        trial[start] = 1.0
+        for _ in range(30):
+            trial[:] = np.array([np.sum(covariance[i, :3] * trial) for i in range(3)])
+            its = math.sqrt(np.sum(trial**2))
+            trial /= max(its, SMALLEST_VARIANCE)
+        if its > variance:
+            axis[:], variance = trial, its
+    return variance
 
 
 @compiled
 def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add the uncertainty on a circle around anchors that lie along a world axis.
+    """Add the uncertainty on a circle around anchors that lie along a line.
 
-    Such anchors leave the angle about their axis open, so the tag may be anywhere on the circle.
+    Such anchors leave the angle about their line open, so the tag may be anywhere on the circle. On the
+    other side its yaw is another one.
 
     Parameters
     ----------
@@ -201,11 +230,14 @@ def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.nd
     covariance : (9, 9) array
         Covariance of position, velocity and attitude, updated in place.
     """
-    flat = ekf.flat
-    if flat[0] + flat[1] + flat[2] != 2.0 or (height_known and flat[2] > 0.0):
+    line = ekf.line
+    if np.sum(line**2) == 0.0 or (height_known and abs(line[2]) < STEEP):
         return
-    away = flat * (x[:3] - ekf.middle)
-    covariance[:3, :3] += np.outer(away, away) + np.diag(0.5 * np.sum(away * away) * flat)
+    across = np.eye(3) - np.outer(line, line)
+    away = x[:3] - ekf.middle
+    away -= np.sum(line * away) * line
+    covariance[:3, :3] += np.outer(away, away) + 0.5 * np.sum(away * away) * across
+    covariance[8, 8] += ANY_YAW**2
 
 
 @compiled
@@ -248,11 +280,8 @@ def distance_outside(bounds: np.ndarray, x: np.ndarray) -> float:
 
     The result is not positive inside, and inf if x is not a number.
     """
-    farthest = -np.inf
-    for k in range(3):
-        beyond = max(bounds[0, k] - x[k], x[k] - bounds[1, k])
-        farthest = np.inf if math.isnan(beyond) else max(farthest, beyond)
-    return farthest
+    beyond = np.maximum(bounds[0] - x[:3], x[:3] - bounds[1])
+    return np.inf if np.isnan(beyond).any() else np.max(beyond)
 
 
 @compiled
