@@ -350,3 +350,23 @@ def test_the_text_of_what_goes_on_stays_until_it_is_over_or_much_else():
     assert steady([nothing]) == [nothing] and steady([replace(nothing, evidence="else")]) == [
         nothing
     ]
+
+
+@pytest.mark.parametrize("rate", [0.5, 2.2, 4.3, 8.0])
+def test_a_tag_that_tumbles_feels_gravity(rate):
+    """At 4.3 rad/s "gravity was taken out": the mean of the force over a second is small."""
+    (t, arrival, gyro, _), tdoas = streams()
+    angle = rate * (t - t[0])
+    force = GRAVITY * np.column_stack([np.zeros(len(t)), np.sin(angle), np.cos(angle)])
+    imu = t, arrival, gyro * 0.0 + [rate, 0.0, 0.0], force + 0.1 * np.sin(np.outer(t, [70, 80, 90]))
+    assert not judged(imu, tdoas).keys() & {"imu_no_gravity", "imu_force_unit", "imu_rate_unit"}
+
+
+@pytest.mark.parametrize("arrivals", [True, False])
+@pytest.mark.parametrize("first, last", [(0.4, 1.0), (0.0, 0.5), (0.0, 1.0)])
+def test_an_imu_that_covers_a_part_of_a_recording_is_named(first, last, arrivals):
+    imu, tdoas = streams()
+    count = len(imu[0])
+    part = tuple(column[int(first * count) : int(last * count)] for column in imu)
+    named = {"imu_partly"} if last - first < 1.0 else set()
+    assert set(judged(part, tdoas, arrivals)) == named

@@ -150,6 +150,9 @@ def test_ranges_alone_show_a_survey_upside_down():
     upside_down = MISTAKES["upside_down_survey"].make(healthy, None, None)
     assert "survey_upside_down" in rules(check(upside_down).findings)
     assert check(healthy).findings == []
+    in_feet = replace(flight.range, d=flight.range.d / 0.3048)
+    (one,) = check(of_flight(replace(flight, tdoa=NO_TDOAS, range=in_feet))).findings
+    assert one.rule == "range_unit" and "0.3048" in one.remedy
 
 
 @pytest.mark.slow

@@ -556,3 +556,48 @@ def test_ranges_that_are_no_distances_are_told(value, share, severity):
         if finding.rule == "range_invalid"
     ]
     assert found == ([severity] if severity else [])
+
+
+ORDERS = {
+    "turned by one": [1, 2, 3, 4, 5, 6, 7, 0],
+    "three": [0, 5, 2, 1, 4, 3, 6, 7],
+    "two pairs": [2, 1, 0, 3, 7, 5, 6, 4],
+    "four": [0, 7, 2, 1, 4, 3, 6, 5],
+    "any": [3, 6, 0, 5, 7, 2, 4, 1],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ORDERS)
+def test_any_order_of_ids_from_the_start_is_named(name):
+    """Four exchanged ids were "TDOAs in nanoseconds", and ids turned by one a wrong sign."""
+    sound = OrderedRecording.of(recording(0, constellation="staircase"))
+    ids = sound.anchors.ids
+    received = dict(zip(ids.tolist(), ids[ORDERS[name]].tolist()))
+    (found, *_), _ = _try_corrections(tdoa_rules.relabelled(sound, received), set(), ())
+    table = {to: one for one, to in received.items() if one != to}
+    assert found.rule == "ids_exchanged" and found.remedy.startswith(
+        f"id = {dict(sorted(table.items()))}"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "up", [(0, 1, False), (0, -1, True), (1, 1, False), (1, -1, False), (2, -1, False)]
+)
+def test_any_axis_of_a_survey_may_point_up(up):
+    sound = OrderedRecording.of(recording(0))
+    turn = imu_rules._upright(*up)
+    wrong = replace(
+        sound, anchors=sound.anchors.at(sound.anchors.positions @ np.linalg.inv(turn).T)
+    )
+    found = imu_rules.find_imu_mistake(wrong)
+    words = ", ".join(imu_rules.signed_axis(row) for row in turn)
+    assert found.rule == "survey_upside_down" and found.remedy.startswith(f"x, y, z = {words} ")
+
+
+@pytest.mark.slow
+def test_a_left_handed_survey_is_a_mirror_image_and_not_upside_down():
+    sound = OrderedRecording.of(recording(0, duration=45.0))
+    wrong = replace(sound, anchors=sound.anchors.at(sound.anchors.positions[:, [1, 0, 2]]))
+    assert imu_rules.find_imu_mistake(wrong).rule == "survey_mirrored"

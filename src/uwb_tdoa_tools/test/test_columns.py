@@ -482,3 +482,33 @@ def test_an_id_counts_where_the_names_of_anchors_end_with_it(tmp_path):
     survey.write_text("name,x,y,z\nNE,0,0,0\nNW,4,0,3\nSW,4,5,0\n")
     # neither the second line nor an id of the radio
     assert read_named_anchors(survey).id_of("1") is None
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["A1", "A2", "A3", "A4"],
+        ["A123", "0E07", "BEEF", "12E3"],
+        ["NO", "NW", "SO", "SW"],  # YAML 1.1 reads NO as false
+        ["1", "on", "off", "y"],
+        ["A5", "B5", "C5", "wall"],
+    ],
+)
+def test_names_of_a_yaml_survey_are_those_of_the_recording(tmp_path, names):
+    """Of A123 beside BEEF the others were dropped, and NO was "no anchor of the survey"."""
+    places = [[0, 0, 0], [4, 0, 3], [4, 5, 0], [0, 5, 3]]
+    survey = tmp_path / "survey.yaml"
+    lines = [f"  {name}: {{position: {place}}}" for name, place in zip(names, places)]
+    survey.write_text("anchors:\n" + "\n".join(lines))
+    named = read_named_anchors(survey)
+    found = [named.anchors.index(np.array([named.id_of(name)]))[0] for name in names]
+    np.testing.assert_array_equal(named.anchors.positions[found], places)
+
+
+def test_a_letter_before_an_id_is_no_other_id(tmp_path):
+    survey = tmp_path / "survey.yaml"
+    survey.write_text("A1: [0, 0, 0]\nA2: [4, 0, 3]\nA7: [4, 5, 0]\n")
+    assert read_survey(survey).ids.tolist() == [1, 2, 7]
+    survey.write_text("A1: [0, 0, 0]\nA2: [4, 0, 3]\nB1: [4, 5, 0]\n")
+    with pytest.raises(InputError, match="must be a whole number"):
+        read_survey(survey)

@@ -26,12 +26,12 @@ FORCE_UNITS = {
     "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
     "mm/s^2": (1e-3, 7e3, 14e3),
 }
-# standard deviation over mean of the specific force above which it has no gravity; healthy 0.41 at
-# most
-WEIGHTLESS = 0.65
+# standard deviation over root mean square of the specific force above which it has no gravity; healthy
+# 0.38 at most
+WEIGHTLESS = 0.55
 # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
 STEADY = 0.8
-# On 29 measured and simulated flights without gravity, the deviation is 0.74 at least or the
+# On 29 measured and simulated flights without gravity, the deviation is 0.59 at least or the
 # steadiness 0.64 at most.
 TURN_EXCESS = 0.35
 # Windows over which rates are integrated, because the bias of a gyroscope turns the result, and
@@ -62,11 +62,12 @@ def force_of(windows: list[ImuWindow]) -> np.ndarray:
 
 
 def weight(windows: list[ImuWindow]) -> float:
-    """Return the median length of the mean specific force, in m/s^2.
+    """Return the median root mean square of the specific force, in m/s^2.
 
-    It equals gravity for any motion within a room, because the mean acceleration is small.
+    It is near gravity for any motion within a room, because accelerations are small on average. A tag
+    that tumbles turns gravity over within a window: the mean of the specific force is then small.
     """
-    return median(float(np.linalg.norm(window.mean[3:])) for window in windows)
+    return median(float(np.linalg.norm([w.mean[3:], w.deviation[3:]])) for w in windows)
 
 
 def shakes(windows: list[ImuWindow]) -> float:

@@ -32,6 +32,7 @@ PACE = 0.05  # largest difference between the pace of the stamps and of the cloc
 # s by which arrivals of a window, or of two streams, must differ from their stamps to count
 APART = 0.1
 LATEST = 5.0  # s that TDOAs may be late; a larger value means another clock
+ENDS = 3.0  # s by which the IMU may begin later than the TDOAs, or end earlier
 DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording, above which a drift is reported
 # s, default waiting times of ekf_node
 LAG, REORDER = (0.25, 0.003)
@@ -402,4 +403,18 @@ def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Iterator[Fin
         )
 
 
-OF_BOTH = (offset, other_clock)
+def partly(imu: list[StampWindow], tdoa: list[StampWindow]) -> Iterator[Finding]:
+    """Yield a Finding if the IMU begins long after the TDOAs, or ends long before them."""
+    late, early = imu[0].begin - tdoa[0].begin, tdoa[-1].end - imu[-1].end
+    if max(late, early) > ENDS and min(late, early) > -ENDS and orderly(imu) and orderly(tdoa):
+        yield Finding(
+            "imu_partly",
+            WARNING,
+            cause="the IMU covers a part of the recording only",
+            evidence=f"it begins {late:+.1f} s after the TDOAs, and ends {early:+.1f} s before them",
+            remedy="ros2 topic hz imu/data  # start both drivers first; look at power and load",
+            value=max(late, early),
+        )
+
+
+OF_BOTH = (offset, other_clock, partly)

@@ -51,8 +51,8 @@ IN_FLIGHT = 4  # windows of 1 s that are checked together in flight
 FEWEST = 3  # fewest of these for a finding
 LATEST = 2  # latest windows that must show a finding too, or it is over
 # Reported by `check` only: in flight, the filter already weights a vibrating accelerometer less.
-# The Monitor names exchanged anchors sooner.
-NOT_IN_FLIGHT = {"imu_shaking", "ids_exchanged"}
+# The Monitor names exchanged anchors sooner, and `status` a silent IMU.
+NOT_IN_FLIGHT = {"imu_shaking", "ids_exchanged", "imu_partly"}
 # rule that does not hold for a tag with a fixed height, which needs three anchors
 FEW_ANCHORS = "few_anchors"
 # cause and evidence of a sign that flips

@@ -170,6 +170,11 @@ def _tried_with_ranges(
     if not isinstance(ranges, Ranges) or names & (NOTHING_TO_TRY | WITHOUT_IMU):
         return []
     paired = OrderedRecording.of(replace(recording, tdoa=differences(ranges, recording.anchors)))
+    unit = tdoa_rules.judge_of(paired).finding
+    if unit is not None and unit.rule == "tdoa_unit":
+        cause = unit.cause.replace("TDOA", "range")
+        remedy = f"range *= {unit.value}  # of nanoseconds; of feet 0.3048"
+        return [replace(unit, rule="range_unit", cause=cause, remedy=remedy)]
     if len(paired.tdoa) >= FEWEST_PAIRS and paired.imu is not None:
         finding = imu_rules.find_imu_mistake(_without_stream_mistakes(paired, found))
         if finding is not None:

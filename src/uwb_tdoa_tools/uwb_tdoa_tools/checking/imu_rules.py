@@ -102,7 +102,11 @@ AS_WITHOUT = 1.3
 NEEDLESS = 0.85
 MOVED = 0.3  # m, standard deviation of positions in motion; measured flights 1.2 at least
 TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
+LEAST_MEAN = (
+    0.5  # length of the mean specific force over its root mean square, below which a tag tumbles
+)
 CHOSEN = 8  # arrangements that are tried on the longer part
+MOST_EQUAL = 8  # arrangements that explain equally much: more of them determine nothing
 # Axes of a survey that may point up, as (number of the axis, sign, whether the survey is mirrored)
 UPWARDS = [up for up in product(range(3), (1, -1), (False, True)) if up != (2, 1, False)]
 BELOW = -0.05  # m, height of the highest anchor below which all are below the floor
@@ -166,6 +170,7 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
         or len(brief.imu) < SLOWEST * PART / 2.0
         or not has_moved(recording.survey_fit.places)
         or is_flat(recording.anchors.positions)
+        or _tumbles(brief.imu)
     ):
         return None
     worse, z = compare(brief.unexplained(), brief.unexplained(config=FilterConfig()))
@@ -189,6 +194,12 @@ def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     return found
 
 
+def _tumbles(imu: Imu) -> bool:
+    """Return whether the specific force has no direction on average: no filter finds what is up."""
+    mean, square = imu.accel.mean(axis=0), np.mean(np.sum(imu.accel**2, axis=1))
+    return bool(np.linalg.norm(mean) < LEAST_MEAN * np.sqrt(square))
+
+
 def _wrong_arrangement(brief: OrderedRecording, base: Unexplained, most: float) -> Finding | None:
     """Return the Finding about axes or units that explain enough, or None.
 
@@ -205,7 +216,7 @@ def _wrong_arrangement(brief: OrderedRecording, base: Unexplained, most: float) 
         trials += _all(brief, base)  # the unit of the rates is right: an axis is wrong
     least = min(one.ratio for one in trials)
     equal = [one for one in trials if one.ratio < least + TIE and one.z > DEVIATIONS]
-    if not equal or least > most:
+    if not 0 < len(equal) <= MOST_EQUAL or least > most:
         return None
     simplest = min(equal, key=lambda one: one.mistakes)
     found = simplest.trial.explained(simplest.ratio, simplest.z)

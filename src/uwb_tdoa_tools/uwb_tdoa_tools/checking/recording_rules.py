@@ -123,8 +123,8 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
             "imu_empty",
             WARNING,
             cause=f"no inertial samples on {IMU}",
-            evidence=f"the topic {of_type[0]} is there, without a message",
-            remedy=f"see that the driver publishes: ros2 topic hz {of_type[0]}",
+            evidence=f"the topic {of_type[0]} is there, without a message that has both sensors",
+            remedy=f"ros2 topic echo {of_type[0]}  # a covariance of -1 means unmeasured (REP 145)",
             value=0.0,
         )
     elif there:
