@@ -319,8 +319,9 @@ def wrong_sign(evidence: str, value: float = math.nan) -> Finding:
 def exchanged(table: dict[int, int], evidence: str, value: float = math.nan) -> Finding:
     """Return the Finding that ids are mixed up, {id as received: id of that anchor}."""
     one, other = [*table][:2]
-    cause = f"two anchors are exchanged, {one} and {other}"
+    cause, or_else = f"two anchors are exchanged, {one} and {other}", ""
     if len(table) > 2:
+        or_else = "; or give the survey of this room, if this is that of another"
         names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
         cause = f"the ids of anchors are mixed up: what is called {names}"
     return Finding(
@@ -328,7 +329,7 @@ def exchanged(table: dict[int, int], evidence: str, value: float = math.nan) -> 
         ERROR,
         cause=cause,
         evidence=evidence,
-        remedy=f"id = {table}.get(id, id)  # or exchange their positions",
+        remedy=f"id = {table}.get(id, id)  # or exchange their positions{or_else}",
         value=float(one) if math.isnan(value) else value,
     )
 
