@@ -180,10 +180,10 @@ class Judge:
         found = set()
         for rows, d in few[::2]:
             for begin in 0.5 * (low + high) + 0.5 * PLACES * across:
-                piece = Piece(*rows.T, d, begin, begin)
+                piece = Piece(rows[:, 0], rows[:, 1], d, begin, begin)
                 found.add(tuple(best_order(surveyed, [piece])[0].tolist()))
-        likely = [tuple(range(len(surveyed))), *sorted(found, key=loss)[:IMPROVED]]
-        likely = {image for order in likely for image in _images(_improved(order, loss), surveyed)}
+        begun = [tuple(range(len(surveyed))), *sorted(found, key=loss)[:IMPROVED]]
+        likely = {image for order in begun for image in _images(_improved(order, loss), surveyed)}
         of_many = partial(loss, some=many)
         best = _improved(min(likely, key=of_many), of_many)
         one, others = _of_order(best), float(np.mean(self._losses, axis=0).min())
