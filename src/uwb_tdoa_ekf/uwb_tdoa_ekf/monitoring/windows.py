@@ -345,7 +345,7 @@ class TdoaWindow(NamedTuple):
     size : float
         Mean |d|, in m.
     ceiling, hits : float, int
-        Largest |d|, in m, and how many TDOAs have it.
+        Largest |d|, in m, and how many TDOAs have it if it is of several pairs.
     grids : (7,) array
         Share of the values that are multiples of GRIDS.
     heard : (N,) array
@@ -423,6 +423,10 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
     either = np.minimum(a, b) * len(positions) + np.maximum(a, b)
     opposed, even = _both_orders(either[mine], (a < b)[mine], d[mine])
 
+    # a timer that repeats the largest value of one pair clips nothing
+    at_ceiling = mine[size == ceiling]
+    hits = len(at_ceiling) if len(np.unique(either[at_ceiling])) > 1 else 0
+
     latest = order[np.flatnonzero(np.diff(pair[order], append=-1))]
     newest = t[np.isfinite(t)][-1:]
     latest = latest[(np.abs(t[latest, None] - newest) < FRESH).any(axis=1)]
@@ -443,7 +447,7 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
         even=even,
         size=float(size.mean()) if len(size) else 0.0,
         ceiling=ceiling,
-        hits=int((size == ceiling).sum()),
+        hits=hits,
         grids=(np.abs(off_grid) < ON_MULTIPLE).sum(axis=0) / max(len(mine), 1),
         heard=np.bincount(np.concatenate([a[mine], b[mine]]), minlength=len(positions)),
         steps=step[leaps & ~later],
