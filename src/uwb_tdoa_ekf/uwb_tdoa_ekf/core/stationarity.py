@@ -187,5 +187,4 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
 @compiled
 def _moves(hypothesis: Record, std: float) -> bool:
     """Return whether inertial samples contradict a velocity of zero within `std` (m/s)."""
-    limits = GATE**2 * (np.diag(hypothesis.P)[3:6] + std**2)
-    return (hypothesis.x[3:6] ** 2 > limits).any()
+    return (hypothesis.x[3:6] ** 2 > GATE**2 * (np.diag(hypothesis.P)[3:6] + std**2)).any()

@@ -231,11 +231,10 @@ def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.nd
         Covariance of position, velocity and attitude, updated in place.
     """
     line = ekf.line
-    if np.sum(line**2) == 0.0 or (height_known and abs(line[2]) < STEEP):
+    if line[0] == line[1] == line[2] == 0.0 or (height_known and abs(line[2]) < STEEP):
         return
     across = np.eye(3) - np.outer(line, line)
-    away = x[:3] - ekf.middle
-    away -= np.sum(line * away) * line
+    away = np.sum(across * (x[:3] - ekf.middle), axis=1)
     covariance[:3, :3] += np.outer(away, away) + 0.5 * np.sum(away * away) * across
     covariance[8, 8] += ANY_YAW**2
 
