@@ -28,6 +28,7 @@ from .ordered import (
     OrderedRecording,
     SurveyFit,
     Trial,
+    displacement,
     second_principal_std,
 )
 from .pair_rules import MANY, OFF
@@ -55,6 +56,9 @@ GAIN = 0.065  # fall of the loss by moving all anchors; measured healthy flights
 # loss as surveyed below which no more than two ids are mixed up: three or more leave 0.27 at least, but
 # for one of 56; the survey of another room, whose anchors another order may resemble, 0.24 at most
 MIXED = 0.25
+# m, median by which anchors still move then: 0.75 at most if the order is right, 1.1 to 2.2 if the
+# survey is of another simulated room with corners elsewhere
+OFF_AT_MOST = 1.0
 POOR = 0.33  # loss as surveyed beyond that of any healthy recording, which is 0.28 at most
 # fall of the loss with anchors fitted to the other half; measured healthy flights 0.052 at most,
 # surveys of other rooms 0.063 at least. In a recording shorter than ENOUGH, s, the tag sees a part
@@ -135,9 +139,14 @@ def judged(recording: OrderedRecording) -> Iterator[Trial]:
     """
     yield Trial(recording.with_tdoa(d=-recording.tdoa.d), wrong_sign(""))
     table, fit = judge_of(recording).order, recording.survey_fit
-    several = len(table) > 2 and fit.before < MIXED
-    if table and not several and second_principal_std(fit.places) >= LEAST_MOTION:
-        yield Trial(relabelled(recording, table), exchanged(table, ""))
+    if not table or second_principal_std(fit.places) < LEAST_MOTION:
+        return
+    other = relabelled(recording, table)
+    if len(table) > 2:
+        off = displacement(fit.positions, other.survey_fit.all_moved[1])
+        if fit.before < MIXED or np.median(off) > OFF_AT_MOST:
+            return
+    yield Trial(other, exchanged(table, ""))
 
 
 def judge_of(recording: OrderedRecording) -> Judge:
