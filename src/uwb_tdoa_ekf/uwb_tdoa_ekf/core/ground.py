@@ -415,7 +415,11 @@ def _equations(
     share (m). system is (n, n + 1). errors is (k, 2), in m: expected error of an anchor that is not
     late, and its standard deviation.
     """
-    pairs, anchors, workspace, prior, parameters = evidence
+    pairs = evidence.pairs
+    anchors = evidence.anchors
+    workspace = evidence.workspace
+    prior = evidence.prior
+    parameters = evidence.parameters
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
