@@ -180,8 +180,8 @@ def learn_motion(ekf: Record, parameters: Record, t: float, innovation: Record) 
     kept = 1.0 - min(dt / COMPARED, 1.0 / COUNTED)
     prior = innovation.prior_variance
     total = prior + innovation.noise_variance * innovation.variance_inflation
-    alone = prior + parameters.tdoa_std**2 * ekf.noise_ratio
-    size = min(abs(innovation.value), LARGEST_CORRECTION * math.sqrt(alone))
+    independent = prior + parameters.tdoa_std**2 * ekf.noise_ratio
+    size = min(abs(innovation.value), LARGEST_CORRECTION * math.sqrt(independent))
     product = one = other = 0.0
     for k in range(3):
         change = innovation.cross_covariance[3 + k] / total * math.copysign(size, innovation.value)
@@ -189,18 +189,20 @@ def learn_motion(ekf: Record, parameters: Record, t: float, innovation: Record) 
         one += change * change
         other += recent[k] ** 2
         recent[k] = kept * recent[k] + change
-    ekf.change_variance = kept**2 * ekf.change_variance + one / max(size**2, 1e-30) * alone
+    ekf.change_variance = kept**2 * ekf.change_variance + one / max(size**2, 1e-30) * independent
     alike = product / math.sqrt(one * other + 1e-30)
     slope = 0.5 * prior / total * (min(innovation.value**2 / total, LARGEST_NIS) - 1.0)
     power = ekf.motion_ratio * math.exp(STEP * (alike + OF_LIKELIHOOD * slope))
     x, P = ekf.hypotheses[ekf.best].x, ekf.hypotheses[ekf.best].P
     speed, place = x[3] ** 2 + x[4] ** 2 + x[5] ** 2, P[0, 0] + P[1, 1] + P[2, 2]
-    if x[3] ** 2 / P[3, 3] + x[4] ** 2 / P[4, 4] + x[5] ** 2 / P[5, 5] > SIGNIFICANT:
+    alone = not t - ekf.velocity.heard < COMPARED  # no sensor of velocities shows rest and motion
+    if not alone or (x[3] ** 2 / P[3, 3] + x[4] ** 2 / P[4, 4] + x[5] ** 2 / P[5, 5] > SIGNIFICANT):
         power = max(power, LEAST_POWER)
     elif speed < SLOW**2 and place < PLACED**2:
         power *= math.exp(-dt * math.sqrt((P[3, 3] + P[4, 4] + P[5, 5]) / place))
     # left: square of the sum of the corrections
-    if power < 1.0 and kept**2 * other + 2.0 * kept * product + one > MOVED * ekf.change_variance:
+    square = kept**2 * other + 2.0 * kept * product + one
+    if alone and power < 1.0 and square > MOVED * ekf.change_variance:
         power, ekf.change_variance, recent[:] = 1.0, 0.0, 0.0
         widen(
             ekf,

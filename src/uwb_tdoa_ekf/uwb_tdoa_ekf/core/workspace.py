@@ -187,7 +187,7 @@ def listen(
     for row in rows:
         away = anchors[row].position - ekf.middle
         scatter += np.outer(away, away)
-    if side[1] == 0.0:
+    if side[1] == 0.0 and len(rows) > 2:  # any two anchors lie along a line
         variance = principal_axis(scatter, ekf.line)
         if np.trace(scatter) - variance > len(rows) * (0.5 * FLAT) ** 2:
             ekf.line[:] = 0.0
