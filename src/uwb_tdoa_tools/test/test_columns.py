@@ -507,7 +507,9 @@ def test_names_of_a_yaml_survey_are_those_of_the_recording(tmp_path, names):
 
 def test_a_letter_before_an_id_is_no_other_id(tmp_path):
     survey = tmp_path / "survey.yaml"
-    survey.write_text("A1: [0, 0, 0]\nA2: [4, 0, 3]\nA7: [4, 5, 0]\n")
+    survey.write_text("A01: [0, 0, 0]\na_2: [4, 0, 3]\nA7: [4, 5, 0]\n")
+    assert read_survey(survey).ids.tolist() == [1, 2, 7]
+    survey.write_text("a1_pos: [0, 0, 0]\na2_pos: [4, 0, 3]\na7_pos: [4, 5, 0]\nstart: [1, 1, 1]\n")
     assert read_survey(survey).ids.tolist() == [1, 2, 7]
     survey.write_text("A1: [0, 0, 0]\nA2: [4, 0, 3]\nB1: [4, 5, 0]\n")
     with pytest.raises(InputError, match="must be a whole number"):

@@ -40,11 +40,11 @@ def read_yaml(path: str | Path) -> Any:
     return parse_yaml(data, path)
 
 
-def parse_yaml(data: bytes | str, name: str | Path, float_texts: bool = False) -> Any:
+def parse_yaml(data: bytes | str, name: str | Path, texts: bool = False) -> Any:
     """Return the content of YAML text or bytes, as `read_yaml`.
 
-    name : for messages; float_texts : return a number that is not whole, and yes or no, as text: an id
-    1E10 is no number, and the anchor NO is in the north-east of a German hall
+    name : for messages; texts : return numbers that are not whole, yes and no as texts: ids such as
+    1E10 and NO are names
     """
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
@@ -53,7 +53,7 @@ def parse_yaml(data: bytes | str, name: str | Path, float_texts: bool = False) -
             f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text."
         ) from error
     try:
-        loader = _Loader(text, Budget(name, len(text)), float_texts)
+        loader = _Loader(text, Budget(name, len(text)), texts)
         try:
             return loader.get_single_data()
         finally:
@@ -103,9 +103,9 @@ _Base: Any = _WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader
 class _Loader(_Base):
     yaml_implicit_resolvers: dict = {}  # YAML 1.1 would read 1:30 as 90, and 1e-3 as text
 
-    def __init__(self, text: str, budget: Budget, float_texts: bool) -> None:
+    def __init__(self, text: str, budget: Budget, texts: bool) -> None:
         super().__init__(text)
-        self._budget, self._depth, self._float_texts = budget, 0, float_texts
+        self._budget, self._depth, self._texts = budget, 0, texts
 
     def compose_node(self, parent: CollectionNode | None, index: int | ScalarNode | None) -> Node:
         event = self.peek_event()
@@ -151,10 +151,10 @@ class _Loader(_Base):
         value = float(re.sub(r"\.(nan|inf)$", r"\1", node.value.lower()))
         if not math.isfinite(value):
             raise _Refused(node.start_mark, f"{node.value[:40]} is not finite; give a number.")
-        return node.value if self._float_texts else value
+        return node.value if self._texts else value
 
     def construct_yaml_bool(self, node: ScalarNode) -> bool | str:
-        return node.value if self._float_texts else super().construct_yaml_bool(node)
+        return node.value if self._texts else super().construct_yaml_bool(node)
 
 
 _TAG = "tag:yaml.org,2002:"

@@ -69,10 +69,12 @@ TURNED = ("orientation", "rotation", "quaternion")
 _UNIT = re.compile(rf"^(.*?)[ (\[]+({'|'.join(filter(None, LENGTHS))})[)\]]?$")
 _UNIT_KEY = re.compile(r"(?:(?:length|distance|position|coordinate|coordinates)[ _-]?)?units?")
 _UNIT_COMMENT = re.compile(r"^\s*#.*?\bunits?\s*[:=]\W*(\w*)", re.IGNORECASE | re.MULTILINE)
+# A1 alone is a name, perhaps a hexadecimal one; a1_pos is the position of anchor 1.
 _NUMBERED = re.compile(
-    r"^(?:anchor|anc|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
+    r"^(?:anchor|anc|beacon|node|a(?=.*[a-z]$))[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
     re.IGNORECASE,
 )
+_LETTERED = re.compile(r"^a[ _-]?([0-9]{1,5})$", re.IGNORECASE)
 _COMMA = re.compile(r"^[-+]?[0-9]+,[0-9]+$")
 _OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
 
@@ -136,7 +138,8 @@ def read_survey(path: str | Path) -> Anchors:
     """
     named = read_named_anchors(path)
     for name, number in named.ids.items():
-        if _decimal(re.sub("^a[ _-]?", "", name, flags=re.IGNORECASE)) != str(number):
+        lettered = _LETTERED.match(name)
+        if lettered is None or int(lettered[1]) != number:
             raise InputError(f"{path}: id is {name[:40]!r}; it must be a whole number.")
     return named.anchors
 
@@ -449,7 +452,7 @@ def _of_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
     content = parse_yaml(
         _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text,
         path,
-        float_texts=True,
+        texts=True,
     )
     frame, unit = "map", ""
     for _ in range(8):  # levels around the anchors: parameter file, and "anchors"

@@ -322,7 +322,7 @@ def _prepare(
         window = initialization.recent(ekf, velocity.SECONDS)
         angle = velocity.compare_path(ekf, anchors, window, parameters.tdoa_std, t)
         if angle != 0.0:
-            initialization.turn_yaw(ekf, parameters, angle, records)
+            initialization.turn_yaw(ekf, angle, records)
     ekf.tdoa_rate += 1.0 - min(1.0, t - ekf.last_tdoa) * ekf.tdoa_rate
     if t >= ekf.next_workspace:
         initialization.update_workspace(ekf, anchors, parameters, t)
@@ -744,7 +744,8 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
         squared += np.sum((ekf.rival - best.x[:3]) ** 2)
     if ekf.consistency < INCONSISTENT:
         squared += initialization.reach(ekf, t) ** 2
-    row.covariance[:3, :3] += squared * np.eye(3)
+    for k in range(3):  # no temporary arrays: this runs for each odometry
+        row.covariance[k, k] += squared
     _report_rate(ekf, parameters, t, row)
     if parameters.planar:
         plane.flatten(row, parameters, wrong)

@@ -705,12 +705,21 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def turn_yaw(ekf: Record, parameters: Record, angle: float, history: np.ndarray) -> None:
-    """Turn the yaw by an angle, rad, because TDOAs and the path of wheels show that it is wrong."""
-    turn_about_vertical(ekf.hypotheses[ekf.best].x, angle)
+def turn_yaw(ekf: Record, angle: float, history: np.ndarray) -> None:
+    """Turn the yaw by an angle, rad, because TDOAs and the path of wheels show that it is wrong.
+
+    Tilt and biases stay.
+    """
+    best = ekf.hypotheses[ekf.best]
+    turn_about_vertical(best.x, angle)
+    for h in range(HYPOTHESES):
+        if h != ekf.best:
+            ekf.hypotheses[h].log_weight = -np.inf
+    hypotheses.set_yaw_variance(best, hypotheses.YAW_STD**2)
+    yaw_check.forget(ekf.yaw_test, False)
     ekf.yaw_test.count += 1
+    ekf.attitude_reset = True
     widen(ekf, history)
-    reset_attitude(ekf, parameters, hypotheses.YAW_STD, history)
 
 
 @compiled

@@ -36,13 +36,14 @@ LIMIT = 3.0  # standard deviations to which an innovation is limited for the sha
 # Motion without inertial samples: step of the logarithm of its power for a TDOA, weight of the
 # likelihood, s over which corrections of the velocity are compared.
 STEP, OF_LIKELIHOOD, COMPARED = (0.1, 0.5, 0.5)
-# Bounds of the power over that of motion_noise: lower one at rest, lower one in motion, upper one.
+# Bounds of the power, relative to motion_noise squared: least at rest, least in motion, largest.
 LEAST_AT_REST, LEAST_POWER, MOST_POWER = (1e-5, 0.01, 100.0)
-# Rest: normalized square of a velocity that is none, m/s and m, least speed and uncertainty of a tag
-# that is not known to rest.
+# Rest. The normalized square of the velocity is below SIGNIFICANT, the speed below SLOW, m/s, and the
+# standard deviation of the position below PLACED, m.
 SIGNIFICANT, SLOW, PLACED = (9.0, 0.2, 1.0)
-# Begin of a motion: least number of corrections that count, standard deviations to which each is
-# limited, their sum squared over its variance that shows a motion, s for which the tag has moved then.
+# Begin of a motion. At least COUNTED corrections of the velocity count, each limited to
+# LARGEST_CORRECTION standard deviations. The square of their sum exceeds MOVED times its variance. The
+# tag has then moved for BEGUN, s.
 COUNTED, LARGEST_CORRECTION, MOVED, BEGUN = (5.0, 4.0, 7.0, 0.6)
 LARGEST_NIS = 6.0  # normalized innovation squared; limits the effect of an outlier
 MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
@@ -204,11 +205,8 @@ def learn_motion(ekf: Record, parameters: Record, t: float, innovation: Record) 
     square = kept**2 * other + 2.0 * kept * product + one
     if alone and power < 1.0 and square > MOVED * ekf.change_variance:
         power, ekf.change_variance, recent[:] = 1.0, 0.0, 0.0
-        widen(
-            ekf,
-            BEGUN**3 / 3.0 * parameters.motion_noise**2,
-            BEGUN * parameters.motion_noise**2,
-        )
+        psd = parameters.motion_noise**2
+        widen(ekf, BEGUN**3 / 3.0 * psd, BEGUN * psd)
     ekf.motion_ratio = min(max(power, LEAST_AT_REST), MOST_POWER)
 
 

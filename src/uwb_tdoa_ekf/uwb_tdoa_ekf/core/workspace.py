@@ -23,7 +23,8 @@ SMALLEST = 3.0
 # determine the side of the tag.
 FLAT = 0.6
 BELOW, ABOVE = SIDES.index("below"), SIDES.index("above")
-STEEP = 0.7  # sine of the slope of a line of anchors that a known height does not tell apart from a mast
+# sine of the slope of a line of anchors; on the circle about a steeper one the height is the same
+STEEP = 0.7
 ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of a yaw that is uniform on the circle
 SMALLEST_VARIANCE = 1e-300  # m^2, replaces a variance of 0
 STD = 1.0  # m, prior standard deviation about the bound for a tag just outside

@@ -24,9 +24,9 @@ from .state import CHECK_PERIOD, ERROR_STATES, propagate_vector
 from .update import GATE
 
 YAW_KNOWN = math.radians(20.0)  # rad, standard deviation below which the yaw counts as known
-# Log likelihood ratio above which the yaw is opened again, the same of a given yaw that velocities have
-# not confirmed, and most of it that the innovations of CHECK_PERIOD can add, unless a quarter of it is
-# more. All trade false alarms against late detection: a moment of bad TDOAs must not suffice. See
+# Log likelihood ratio above which the yaw is opened again, and the limit for a given yaw that velocities
+# have not confirmed. The innovations of CHECK_PERIOD add the third number at most, or a quarter of what
+# they gain. All trade false alarms against late detection: a moment of bad TDOAs must not suffice. See
 # docs/notebook/reliability.md for the ratios of 22 measured flights.
 EVIDENCE, UNCONFIRMED_EVIDENCE, MOST_AT_ONCE = (6.0, 1.6, 0.4)
 CONFIRMED = 4.0  # s of motion with velocities that agree, after which a given yaw is confirmed
@@ -45,7 +45,7 @@ def clear(doubt: Record) -> None:
 def forget(doubt: Record, given: bool) -> None:
     """Clear a YAW_TEST, because the yaw was replaced.
 
-    given is whether nothing but the user, or an earlier filter, gives the new yaw.
+    given is whether measurements have not confirmed the new yaw yet: a user or an earlier filter gave it.
     """
     clear(doubt)
     doubt.vector[:] = 0.0

@@ -172,7 +172,7 @@ def _tried_with_ranges(
     paired = OrderedRecording.of(replace(recording, tdoa=differences(ranges, recording.anchors)))
     unit = tdoa_rules.judge_of(paired).finding
     if unit is not None and unit.rule == "tdoa_unit":
-        cause = unit.cause.replace("TDOA", "range")
+        cause = "ranges are in nanoseconds or in feet, not in metres"
         remedy = f"range *= {unit.value}  # of nanoseconds; of feet 0.3048"
         return [replace(unit, rule="range_unit", cause=cause, remedy=remedy)]
     if len(paired.tdoa) >= FEWEST_PAIRS and paired.imu is not None:
@@ -305,16 +305,16 @@ def _try_corrections(
 
 
 def _misfit(fit: SurveyFit) -> Finding | None:
-    """Return the finding on a survey that fits much better with anchors moved, or late; or none."""
+    """Return the Finding on a survey that fits much better with anchors moved, or late; or None."""
     if tdoa_rules.is_of_delays(fit):
         less = 100.0 * (1.0 - fit.late_loss / fit.before)
         return Finding(
             "anchors_late",
             ERROR,
-            "several anchors are late or early: no anchor needs to stand elsewhere",
-            f"{less:.0f} % less stays unexplained with a delay of each anchor",
-            "calibrate the delays: survey, or diagnose; look what stands before the anchors",
-            fit.late_loss,
+            cause="several anchors are late or early: no anchor needs to stand elsewhere",
+            evidence=f"{less:.0f} % less stays unexplained with a delay of each anchor",
+            remedy="calibrate the delays: survey, or diagnose; look what stands before the anchors",
+            value=fit.late_loss,
         )
     gain = tdoa_rules.gained(fit)
     if gain is not None:
@@ -323,21 +323,23 @@ def _misfit(fit: SurveyFit) -> Finding | None:
         return Finding(
             "survey_misfit",
             ERROR,
-            f"the survey does not fit: of another room, or anchors have been moved{or_late}",
-            f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
-            f"by {np.median(moved):.1f} m in the median",
-            OTHER_SURVEY,
-            gain,
+            cause=f"the survey does not fit: of another room, or anchors have been moved{or_late}",
+            evidence=(
+                f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors "
+                f"elsewhere, by {np.median(moved):.1f} m in the median"
+            ),
+            remedy=OTHER_SURVEY,
+            value=gain,
         )
     enough = fit.seconds >= tdoa_rules.SHORTEST and len(fit.positions) <= MANY and not fit.flat
     if enough and fit.before > tdoa_rules.POOR:
         return Finding(
             "survey_misfit",
             ERROR,
-            "the survey does not fit: of another room, or its ids are mixed up",
-            "wherever the tag is, and with any anchors moved, the TDOAs do not fit",
-            OTHER_SURVEY,
-            fit.before,
+            cause="the survey does not fit: of another room, or its ids are mixed up",
+            evidence="wherever the tag is, and with any anchors moved, the TDOAs do not fit",
+            remedy=OTHER_SURVEY,
+            value=fit.before,
         )
     if tdoa_rules.apparent_gain(fit) <= tdoa_rules.GAIN:
         return None
@@ -346,20 +348,30 @@ def _misfit(fit: SurveyFit) -> Finding | None:
         return Finding(
             "radio_errors",
             WARNING,
-            "the errors of the TDOAs depend on the place of the tag: no anchor is blamed",
-            "errors of each anchor that change with the place explain more than anchors elsewhere: "
-            f"{more:.0f} % less stays unexplained",
-            "look what stands between tag and anchors: a body, metal, a wall; localize --zones "
-            "shows where",
-            more,
+            cause="the errors of the TDOAs depend on the place of the tag: no anchor is blamed",
+            evidence=(
+                "errors of each anchor that change with the place explain more than anchors "
+                f"elsewhere: {more:.0f} % less stays unexplained"
+            ),
+            remedy=(
+                "look what stands between tag and anchors: a body, metal, a wall; localize --zones "
+                "shows where"
+            ),
+            value=more,
         )
     return Finding(
         "misfit_unclear",
         NOTE,
-        "the TDOAs fit the survey less well than usual, and this recording does not determine why",
-        "with the anchors elsewhere each half of the recording fits better, and not the other half",
-        "record a minute in which the tag is carried through the whole room, and check again",
-        tdoa_rules.apparent_gain(fit),
+        cause=(
+            "the TDOAs fit the survey less well than usual, and this recording does not determine "
+            "why"
+        ),
+        evidence=(
+            "with the anchors elsewhere each half of the recording fits better, and not the other "
+            "half"
+        ),
+        remedy="record a minute in which the tag is carried through the whole room, and check again",
+        value=tdoa_rules.apparent_gain(fit),
     )
 
 

@@ -102,9 +102,8 @@ AS_WITHOUT = 1.3
 NEEDLESS = 0.85
 MOVED = 0.3  # m, standard deviation of positions in motion; measured flights 1.2 at least
 TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
-LEAST_MEAN = (
-    0.5  # length of the mean specific force over its root mean square, below which a tag tumbles
-)
+# length of the mean specific force over its root mean square; a tag with less tumbles
+LEAST_MEAN = 0.5
 CHOSEN = 8  # arrangements that are tried on the longer part
 MOST_EQUAL = 8  # arrangements that explain equally much: more of them determine nothing
 # Axes of a survey that may point up, as (number of the axis, sign, whether the survey is mirrored)
@@ -244,27 +243,34 @@ def _turned_survey(base: Unexplained, recording: OrderedRecording, most: float) 
     """Return the Finding that z of the survey is not up, or None.
 
     Systems that survey their own anchors lay the plane z = 0 through three of them, not on the
-    floor. Motion capture and game engines have y up. A mirror image with z up is a rival here, which
-    the arrangements of the IMU name.
+    floor. Motion capture and game engines have y up. A mirror image with z up competes too, but the
+    arrangements of the IMU name it.
 
     most : largest ratio of the losses that may remain
     """
-    places, better = recording.anchors.positions, []
+    places, better = recording.anchors.positions, {}
     for up in UPWARDS:
-        turned = recording.anchors.at(places @ _upright(*up).T)
-        ratio, z = compare(
-            base, replace(recording, anchors=turned).unexplained(RATIO * base.mean, LEANING)
-        )
+        turned = replace(recording, anchors=recording.anchors.at(places @ _upright(*up).T))
+        ratio, z = compare(base, turned.unexplained(RATIO * base.mean, LEANING))
         if ratio < most and z > DEVIATIONS:
-            below = turned.positions[:, 2].max() < BELOW
-            better.append((below, up[2], ratio, z, up))
-    if not better:
+            better[up] = ratio, z
+    least = min(better.values(), default=(np.inf, 0.0))[0]
+    alike = [up for up, (ratio, _) in better.items() if ratio < least + TIE]
+    if not alike:
         return None
-    # Level motion does not tell what is up from what is down, but anchors are above the floor.
-    least = min(ratio for _, _, ratio, _, _ in better)
-    _, _, ratio, z, (axis, sign, mirrored) = min(one for one in better if one[2] < least + TIE)
+
+    def mistakes(up: tuple[int, int, bool]) -> tuple[bool, bool, float]:
+        """Return whether all anchors are below the floor then, whether it mirrors, and the ratio.
+
+        Level motion does not show what is up and what is down.
+        """
+        heights = (places @ _upright(*up).T)[:, 2]
+        return bool(heights.max() < BELOW), up[2], better[up][0]
+
+    axis, sign, mirrored = min(alike, key=mistakes)
     if (axis, sign) == (2, 1):
         return None
+    ratio, z = better[axis, sign, mirrored]
     name, where = "xyz"[axis], "up" if sign > 0 else "down"
     axes = ", and its axes are left-handed" * mirrored
     turn = ", ".join(map(signed_axis, _upright(axis, sign, mirrored)))

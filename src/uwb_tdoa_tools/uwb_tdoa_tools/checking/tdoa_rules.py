@@ -73,8 +73,8 @@ AS_RADIO = 0.9
 # nothing else is wrong, and 0.75 to 0.91 (measured); the survey of another day 0.90 at most
 AS_LATE = 0.93
 ALONE = 0.85  # share of the gain that one anchor explains, or delays do
-# the same of the gain with a delay of each anchor: one moved anchor 0.92 at least where ALONE holds;
-# two or three late ones 0.90 at most (one of 29: 0.98)
+# the same of the gain with a delay of each anchor. Where ALONE holds, one moved anchor explains 0.92 at
+# least, and one in place of two or three late ones 0.90 at most (one of 15 simulated recordings: 0.98).
 BESIDE_DELAYS = 0.91
 # windows with a position; TDOAs of an anchor that may have the id of another; successive TDOAs
 FEWEST = 10

@@ -108,7 +108,7 @@ def _convert(args: Namespace) -> None:
         return _suggest(args)
     if not args.out:
         raise InputError("--out: is missing; give the path of the bag to write.")
-    from ..bags.bag import convert, described, shifted
+    from ..converting import convert, described, shifted
     from ..scoring.evaluation import on_one_clock
 
     offsets = _offsets(args.offsets)
