@@ -165,7 +165,7 @@ def _is_sparse(flight: Flight, config: FilterConfig, odometry: Odometry) -> bool
     """
     felt = config.use_imu and flight.imu is not None
     alone = not felt and flight.velocity is None and flight.range is None
-    few = len(flight.tdoa) < SPARSE * (flight.end - flight.start)
+    few = len(flight.tdoa) < SPARSE * flight.duration
     variance = np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2)
     return alone and few and config.adapt_noise and bool(np.mean(variance > SMALLEST**2) > 0.5)
 

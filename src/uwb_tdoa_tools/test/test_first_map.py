@@ -18,7 +18,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import localize
 from uwb_tdoa_tools.commands.map_anchors import main
 from uwb_tdoa_tools.first_map import map_anchors, observe
-from uwb_tdoa_tools.first_map.least_squares import Equations, Fit, Problem, Stage, rigid_distance
+from uwb_tdoa_tools.first_map.least_squares import Equations, Fit, Problem, rigid_distance
 from uwb_tdoa_tools.first_map.observations import STEP, G, _Level
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.surveying.report import read_coordinates
@@ -128,7 +128,7 @@ def test_levelled_accelerations_are_second_differences_of_positions(roll, pitch,
 def test_gradient_is_that_of_the_cost(flight, inertial):
     seen = seen_of([flight], (0, 2, 1.0, 0.5))
     distances = np.array([(0, 1, 5.0, 0.1), (2, 3, 4.0, 0.1)])
-    problem = Problem(replace(seen, distances=distances, delay_std=0.1), Stage(inertial=inertial))
+    problem = Problem(replace(seen, distances=distances, delay_std=0.1), inertial)
     rng = np.random.default_rng(0)
     path = rng.uniform(-2.0, 2.0, (problem.bins, 3))
     columns = rng.uniform(-1.0, 1.0, problem.layout.size)

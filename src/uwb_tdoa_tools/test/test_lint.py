@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from uwb_tdoa_bias.common.errors import version
 from uwb_tdoa_bias.ros.cdr import decode
 from uwb_tdoa_bias.ros.node import StreamNode
-from uwb_tdoa_bias.ros.topics import Input, SubscribingNode
+from uwb_tdoa_bias.ros.topics import Input
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected
 
 version() + 1  # operator
@@ -35,14 +35,12 @@ def take_row(tdoa: Tdoa, data: bytes) -> float:
 
 def take_texts(texts: list[str]) -> None: ...
 
-def subscribe(node: StreamNode, other: SubscribingNode) -> None:
+def subscribe(node: StreamNode) -> None:
     Input(node, Odometry, "odometry", take, 10)
     Input(node, Tdoa, "odometry", take, 10)  # arg-type
     Input(node, Odometry, "odometry", take_texts, 10, bytes)  # misc
     node.create_subscription(Odometry, "odometry", take, 10)
     node.create_subscription(Tdoa, "odometry", take, 10)  # arg-type
-    other.create_subscription(Odometry, "odometry", take, 10)
-    other.create_subscription(Tdoa, "odometry", take, 10)  # arg-type
 
 def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
     response.succes = True  # attr-defined

@@ -298,11 +298,10 @@ def figures(monkeypatch):
     """Return [(figure, title)] of all pictures to be written."""
     made = []
 
-    def write(path, save):
-        figure = save.func.__self__
+    def write(path, figure, dpi):
         made.append((figure, figure.get_suptitle()))
 
-    monkeypatch.setattr(plots, "write_filled", write)
+    monkeypatch.setattr(plots, "write_picture", write)
     return made
 
 

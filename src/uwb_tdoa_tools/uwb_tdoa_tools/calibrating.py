@@ -14,11 +14,12 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import counted
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
+from uwb_tdoa_ekf.results import rows_of
 
 from . import cli, command_lines
 from .checking import report
@@ -48,7 +49,6 @@ SECONDS = 60.0  # of a flight that are looked at
 FORECAST_FLIGHTS = 3  # largest number of flights that are looked at with ground truth
 SMALLEST_EXTENT = 0.25  # smallest extent of a path along an axis, relative to the anchors
 SMALLEST_IMPROVED_SHARE = 0.5  # share of the coordinates that must improve
-STREAMS = "tdoa", "imu", "truth", *SENSOR_NAMES
 
 
 @dataclass(frozen=True, eq=False)
@@ -460,24 +460,6 @@ def forecast(
     )
 
 
-def expectation(
-    flights: Sequence[Flight],
-    truth: bool,
-    tape: Tape,
-    base: EffectSet,
-    config: FilterConfig,
-    progress: Callable[[str], object],
-) -> Forecast | Prospect:
-    """Return what a calibration is likely to gain: a Forecast with ground truth, else a Prospect.
-
-    progress : progress(text) is called every few seconds; other arguments as of these functions
-    """
-    looking = partial(progress, "looking at a part of the flights")
-    if truth:
-        return forecast(flights, base, config, looking)
-    return prospect(flights, tape, base, config, looking)
-
-
 def prospect(
     flights: Sequence[Flight],
     tape: Tape = Tape(),
@@ -489,12 +471,13 @@ def prospect(
 
     Raises InputError if the flights are too short.
     """
-    longest = max(flights, key=_duration)
+    longest = max(flights, key=lambda flight: flight.duration)
     middle = 0.5 * (longest.start + longest.end)
     part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
     found = self_calibrate([part], tape, base, config, (), progress)
     seconds = found.seconds
-    total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
+    of_all = sum(flight.duration for flight in flights)
+    total = max(seconds, of_all * seconds / max(part.duration, 1e-9))
     estimate = FlightEstimator(config, base)(part).odometry
     path = np.quantile(estimate.p, [0.02, 0.98], axis=0)
     on_floor = Nothing(config).on_floor(Truth(estimate.t, estimate.p, estimate.q))
@@ -514,11 +497,6 @@ def prospect(
     )
 
 
-def _duration(flight: Flight) -> float:
-    """Return the time in which a Flight has TDOAs or ranges, s."""
-    return flight.end - flight.start
-
-
 def _expected(found: SelfCalibration, more: float) -> np.ndarray:
     """Return the standard deviations after `more` times the analysed data: (N, 3) m.
 
@@ -533,16 +511,14 @@ def _expected(found: SelfCalibration, more: float) -> np.ndarray:
 
 def between(flight: Flight, first: float, last: float) -> Flight:
     """Return the part of a Flight stamped from `first` to before `last`, s."""
-    cut = {}
-    for name in STREAMS:
-        stream = getattr(flight, name)
-        if stream is not None:
-            inside = (stream.t >= first) & (stream.t < last)
-            cut[name] = type(stream)(*(column[inside] for column in vars(stream).values()))
+    cut = {
+        name: rows_of(stream, (stream.t >= first) & (stream.t < last))
+        for name, stream in flight.streams.items()
+    }
     return replace(flight, extra={}, **cut)
 
 
 def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
     """Split a Flight at a share of its located time."""
-    middle = flight.start + share * (flight.end - flight.start)
+    middle = flight.start + share * flight.duration
     return between(flight, -np.inf, middle), between(flight, middle, np.inf)

@@ -14,7 +14,6 @@ MODELS = "paper", "physics"  # of train
 # visual-inertial odometry
 DRIFT = 0.02
 PLAN_TIME, PLAN_SPEED = 60.0, 1.0  # s and m/s, of a flight that diagnose plans
-STREAMS = "tdoa", "imu", "truth"  # of a Flight, each on its own clock, besides those of SENSORS
 TAPE_STD, TRUSTED_STD = 0.1, 0.01  # m, of a coordinate of an anchor by a tape, and of a trusted one
 WAIT = 10.0  # s, until a subscription to a replay must exist
 MAP_ACCURACY = 1.0  # m, largest 3D standard deviation of an anchor of a first map

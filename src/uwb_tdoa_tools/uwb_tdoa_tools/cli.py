@@ -182,8 +182,9 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Write a dict as JSON, with the version of the suite. Raises ValueError for NaN."""
-    text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
+    """Write a dict as JSON, with the version of the suite; paths as text. Raises ValueError for NaN."""
+    whole = {"written_by": written_by(), **content}
+    text = json.dumps(whole, indent=1, allow_nan=False, default=os.fspath)
     write_text(path, text + "\n")
 
 

@@ -12,16 +12,13 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.sensors import Stream
 from uwb_tdoa_ekf.results import rows_of
 
-from . import choices
 from .bags.bag import check_output, write_bag
 
 Timed = Tdoas | Imu | Truth | Stream
-
-CONVERTED = *choices.STREAMS, *SENSOR_NAMES
 
 
 def convert(
@@ -138,8 +135,7 @@ def _from_zero_on(flight: Flight) -> Flight:
 
 def _held(flight: Flight) -> dict[str, Timed]:
     """Return {name: stream} of the streams that have messages."""
-    streams = {name: getattr(flight, name) for name in CONVERTED}
-    return {name: of for name, of in streams.items() if of is not None and len(of.t)}
+    return {name: of for name, of in flight.streams.items() if len(of.t)}
 
 
 def _overlaps(one: Timed, flight: Flight) -> bool:

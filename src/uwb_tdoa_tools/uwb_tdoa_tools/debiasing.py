@@ -7,7 +7,7 @@ Flights, and places where a tag stood still, give a map. Cross-validation over f
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,43 +51,6 @@ def debiased(odometry: Odometry, bias_map: BiasMap) -> Odometry:
     return replace(odometry, p=p, covariance=covariance)
 
 
-def estimate_flight(
-    flight: Flight,
-    config: FilterConfig | None = None,
-    effects: EffectSet | None = None,
-    align: str = NONE,
-) -> Scored:
-    """Run a flight with ground truth through the filter.
-
-    Parameters
-    ----------
-    flight : Flight
-    config : FilterConfig, optional
-    effects : EffectSet, optional
-    align : str
-        See `align_truth`.
-
-    Returns
-    -------
-    tuple of Flight, Score and Odometry
-
-    Raises
-    ------
-    InputError
-        If the flight has no ground truth. Other references serve `diagnose`, which corrects before the
-        filter. A map of the path of the filter would repeat its error.
-    """
-    if flight.truth is None:
-        raise InputError(
-            f"{flight.name}: it holds no ground truth to map the bias with; diagnose "
-            "--reference heights, odometry or marks finds what is "
-            "wrong without it, and --effects takes that."
-        )
-    flight = with_aligned_truth(flight, effects, config, align)
-    score, run = evaluate(flight, config, effects)
-    return flight, score, run.odometry
-
-
 @dataclass(frozen=True)
 class PositionEstimator:
     """Estimate recordings with fixed settings. It can be pickled.
@@ -99,7 +62,7 @@ class PositionEstimator:
     effects : EffectSet, optional
         Corrections of the TDOAs.
     align : str
-        See `align_truth`.
+        See `scoring.evaluation.align_truth`.
     """
 
     reading: Reading = Reading()
@@ -108,27 +71,22 @@ class PositionEstimator:
     align: str = NONE
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
-        """Return the result of `estimate_flight` for (path, survey)."""
+        """Return the flight of (path, survey) with ground truth, its Score and its Odometry.
+
+        Raises InputError without ground truth. Other references serve `diagnose`, which corrects
+        before the filter. A map of the path of the filter would repeat its error.
+        """
         flight = self.reading.read(recording)
         report_remarks(flight.name, orientation_remarks(flight.anchors, self.effects))
-        return estimate_flight(flight, self.config, self.effects, self.align)
-
-
-def require_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
-    """Yield the flights.
-
-    Raises
-    ------
-    InputError
-        If the anchors of a flight are not those of the map.
-    """
-    for one in flown:
-        if not bias_map.belongs_to(one[0].anchors):
+        if flight.truth is None:
             raise InputError(
-                f"{one[0].name}: its anchors are not those that the map was made for, and "
-                "elsewhere it does harm; make one for them with debias fit."
+                f"{flight.name}: it holds no ground truth to map the bias with; diagnose "
+                "--reference heights, odometry or marks finds what is "
+                "wrong without it, and --effects takes that."
             )
-        yield one
+        flight = with_aligned_truth(flight, self.effects, self.config, self.align)
+        score, run = evaluate(flight, self.config, self.effects)
+        return flight, score, run.odometry
 
 
 def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
@@ -171,9 +129,19 @@ def comparison_rows(
     """Return figures before and after the map for each flight.
 
     `known` is the share of positions inside the map.
+
+    Raises
+    ------
+    InputError
+        If the anchors of a flight are not those of the map.
     """
     out = []
     for flight, score, odometry in flown:
+        if not bias_map.belongs_to(flight.anchors):
+            raise InputError(
+                f"{flight.name}: its anchors are not those that the map was made for, and "
+                "elsewhere it does harm; make one for them with debias fit."
+            )
         after = evaluate_map((flight, score, odometry), bias_map, effects)
         sides = {"before": score.row(), "after": after.row()}
         airborne = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]

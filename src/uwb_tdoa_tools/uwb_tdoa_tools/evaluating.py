@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.files import write_picture
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.results import Odometry, Residuals
@@ -139,9 +140,9 @@ class Evaluator:
                 [text for text in causes or truth_findings if text not in survey_sentences],
             )
         if self.picture:
-            from .scoring.plots import plot_error  # takes a second to import
+            from .scoring.plots import error_figure  # takes a second to import
 
-            plot_error(score, odometry, truth, self.picture)
+            write_picture(self.picture, error_figure(score, odometry, truth))
         if self.trajectories:
             folder, name = self.trajectories, file_name(flight.name)
             write_tum(folder / f"{name}.tum", odometry.t, odometry.p, odometry.q)
@@ -261,7 +262,12 @@ def lines_of_attitude(attitudes: Mapping[str, tuple[float, ...]]) -> Iterator[st
 
 def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
     """Return lines on the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
-    head_line, *rows = _table_of_phases(phases)
+    columns = PHASE | (OF_RUNS if any("runs" in figures for figures in phases.values()) else {})
+    head_line = ["phase", *columns.values()]
+    rows = [
+        [TITLES[name], *(_cell(figures[key]) for key in columns)]
+        for name, figures in phases.items()
+    ]
     return [
         f"{row[0]:20s}"
         + "".join(
@@ -269,15 +275,6 @@ def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
         )
         for row in (head_line, *rows)
     ]
-
-
-def _table_of_phases(phases: dict[str, dict[str, Any]]) -> list[list[str]]:
-    columns = PHASE | (OF_RUNS if any("runs" in figures for figures in phases.values()) else {})
-    rows = [
-        [TITLES[name], *(_cell(figures[key]) for key in columns)]
-        for name, figures in phases.items()
-    ]
-    return [["phase", *columns.values()], *rows]
 
 
 def _cell(value: float | None) -> str:

@@ -4,12 +4,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from uwb_tdoa_bias.common.executable import executable, node_executable
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def __getattr__(name: str) -> Callable[..., object]:

@@ -10,6 +10,7 @@ installation compiles nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 import gc
@@ -20,17 +21,12 @@ import stat
 import sys
 import time
 from types import CodeType, ModuleType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from . import executable  # it also imports numba in another folder
 from .files import new_folder_until_exit
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
-    from numba.core.event import Event
 
 
 @contextmanager
@@ -146,7 +142,7 @@ class _Listener(event.Listener):
         self._share = 0.0  # reported last; more modules make it smaller, which would irritate
         self._collect = gc.get_threshold()
 
-    def on_start(self, event: Event) -> None:
+    def on_start(self, event: event.Event) -> None:
         if not self._depth:
             if not self._spent.any() and not any(_place("code").rglob("*.nbi")):
                 text = "compiling the filter, which is done once and takes about a minute"
@@ -156,7 +152,7 @@ class _Listener(event.Listener):
         self._depth += 1
         self._tell()
 
-    def on_end(self, event: Event) -> None:
+    def on_end(self, event: event.Event) -> None:
         self._tell()
         self._depth -= 1
         if not self._depth:

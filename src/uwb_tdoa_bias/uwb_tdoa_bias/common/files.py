@@ -14,7 +14,7 @@ from pathlib import Path
 import secrets
 import stat
 import tempfile
-from typing import BinaryIO
+from typing import Any, BinaryIO
 from zipfile import BadZipFile, ZipFile, ZipInfo
 import zlib
 
@@ -80,6 +80,11 @@ def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
     buffer = io.BytesIO()
     fill(buffer)
     write_bytes(path, buffer.getvalue())
+
+
+def write_picture(path: str | Path, figure: Any, dpi: int = 110) -> None:
+    """Write a Figure of matplotlib as an image; otherwise as `write_bytes`."""
+    write_filled(path, lambda file: figure.savefig(file, dpi=dpi))
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

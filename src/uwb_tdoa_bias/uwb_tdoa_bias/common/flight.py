@@ -14,6 +14,7 @@ from .errors import sanitize
 from .sensors import LOCATING, SENSORS
 
 SENSOR_NAMES = tuple(SENSORS)  # optional streams of a Flight
+STREAMS = "tdoa", "imu", "truth", *SENSOR_NAMES  # of a Flight, each on its own clock
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,16 @@ class Flight(_SensorStreams):
         """TDOAs; without any, the other streams that locate the tag."""
         streams = [self.tdoa] if len(self.tdoa) else [getattr(self, name) for name in LOCATING]
         return [stream for stream in streams if stream is not None and len(stream)]
+
+    @property
+    def duration(self) -> float:
+        """Time from `start` to `end`, s."""
+        return self.end - self.start
+
+    @property
+    def streams(self) -> dict[str, Any]:
+        """The streams that it has, by their names in STREAMS."""
+        return {name: part for name in STREAMS if (part := getattr(self, name)) is not None}
 
     def replaced(self, **streams: Any) -> Flight:
         """Return the Flight with other streams, given by name; None removes a stream."""

@@ -5,19 +5,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from .anchors import Anchors
 from .errors import InputError
 from .files import read_arrays, write_filled
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import ArrayLike
-
-    from .anchors import Anchors
 
 _FIELDS = {  # fields of the file, and their dtype kinds
     "frame": "U",

@@ -54,17 +54,11 @@ class Correction:
     state: np.ndarray
 
     @classmethod
-    def flat(
-        cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
-    ) -> Correction:
-        """Return the Correction of raw d (n,) m by a bias (n,) m that is constant in the state."""
-        return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
-
-    @classmethod
     def none(cls, d: np.ndarray) -> Correction:
         """Return the Correction of raw d (n,) m without any known bias."""
         bias, std = np.zeros((2, len(d)))
-        return cls.flat(d, bias, std, np.full(len(d), PASSED, dtype=np.uint8))
+        status = np.full(len(d), PASSED, dtype=np.uint8)
+        return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
 
 class Corrector:

@@ -42,7 +42,6 @@ from ..effects.samples import N_STATES, Samples
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from ..effects.samples import Samples
     from .session import Session
 
 

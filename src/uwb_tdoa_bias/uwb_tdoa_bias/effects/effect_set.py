@@ -19,7 +19,7 @@ import yaml
 from ..common.anchors import Anchors
 from ..common.errors import InputError, written_by
 from ..common.files import write_text
-from ..common.flight import SENSOR_NAMES, Flight
+from ..common.flight import SENSOR_NAMES, STREAMS, Flight
 from ..common.safe_yaml import read_yaml
 from ..common.sensors import STREAM_OF
 from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Stream
@@ -349,9 +349,8 @@ class EffectSet:
     def correct_streams(self, flight: Flight) -> Flight:
         """Return the Flight with its streams corrected, see StreamCorrector."""
         corrector = StreamCorrector(self.effects)
-        parts = {name: part for name in STREAMS if (part := getattr(flight, name)) is not None}
         return flight.replaced(
-            **{name: corrector.correct(name, part) for name, part in parts.items()}
+            **{name: corrector.correct(name, part) for name, part in flight.streams.items()}
         )
 
     @classmethod
@@ -440,9 +439,6 @@ def _moved(samples: Samples, states: tuple[int, ...]) -> Samples:
         return replace(out, p=position)
     motion = replace(out.motion, velocity=out.motion.velocity + by[:, 3:])
     return replace(out, p=position, motion=motion)
-
-
-STREAMS = ("tdoa", "imu", "truth", *SENSOR_NAMES)  # of a Flight
 
 
 class ImuCorrector:

@@ -7,7 +7,8 @@ Input of TF into a node: constant transforms, and on request moving ones.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
@@ -22,14 +23,9 @@ from ..common.anchors import SAME_PLACE, Anchors, refuse_faulty
 from ..common.errors import InputError
 from ..common.survey import read_survey
 from ..common.transforms import Frames
+from .node import StreamNode
 from .parameters import MOST_QUOTED, Parameter
 from .topics import Input, Refusals, publishers_of
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from .node import StreamNode
-
 
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL

@@ -16,7 +16,8 @@ import re
 import signal
 import sys
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from types import FrameType
+from typing import Any, Protocol, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import rclpy
@@ -24,6 +25,7 @@ from rclpy.clock import Clock as SteadyClock, ClockType, ROSClock
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
@@ -38,13 +40,6 @@ from ..common.executable import interrupt
 from .cdr import Message, decode
 from .parameters import ParameterNode
 from .topics import unserved, waiting
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import FrameType
-
-    from rclpy.node import Node
-
 
 Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 

@@ -8,47 +8,29 @@ rows and stamps in s.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from copy import copy
 import time
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..common.stamps import LARGEST_STEP_BACK
 from .cdr import CdrCodec, CdrTemplate, Message, Unreadable, decode, name_of
+from .parameters import ParameterNode
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
-
-    from rclpy.node import Node
-    from rclpy.publisher import Publisher
-    from rclpy.subscription import Subscription
-    from rclpy.topic_endpoint_info import TopicEndpointInfo
-
-    from .parameters import ParameterNode
-
-    # frame, stamps, rows and arrivals
-    Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]
-
+# frame, stamps, rows and arrivals
+Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]
 Content = TypeVar("Content")  # what is read of a message
 Part = tuple[str, np.ndarray, np.ndarray]  # frame, rows and arrivals of successive messages
-
-
-class SubscribingNode(Protocol):
-    """A node of rclpy. Type checkers compare its callbacks with the types of the messages."""
-
-    def create_subscription(
-        self,
-        msg_type: type[Message],
-        topic: str,
-        callback: Callable[[Message], None],
-        qos_profile: QoSProfile | int,
-    ) -> Subscription:
-        """Subscribe as rclpy does."""
 
 
 class Epoch:

@@ -84,7 +84,7 @@ def parser() -> ArgumentParser:
 def _calibrate(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..calibrating import expectation, usable_paths, with_truth, without_truth
+    from ..calibrating import forecast, prospect, usable_paths, with_truth, without_truth
     from ..diagnosis.noise import has_imu
     from ..estimate import FlightEstimator
 
@@ -115,8 +115,12 @@ def _calibrate(args: Namespace) -> int:
         options.refuse(args, options.OF_TAPE, f"{because}; give --no-truth, too")
     if args.quick:
         with Progress("calibrate") as progress:
-            expected = expectation(flights, all(known), tape, base, config, progress)
-        cli.show(*expected.sentences())
+            looking = partial(progress, "looking at a part of the flights")
+            if all(known):
+                sentences = forecast(flights, base, config, looking).sentences()
+            else:
+                sentences = prospect(flights, tape, base, config, looking).sentences()
+        cli.show(*sentences)
         return 0
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]

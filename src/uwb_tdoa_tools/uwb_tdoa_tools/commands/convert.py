@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.flight import STREAMS
 
 from .. import cli, options
-from ..choices import COLUMNS, STREAMS
+from ..choices import COLUMNS
 from ..cli import OutputBag, OutputFile, option
 from ..command_lines import tool
 from ..parallel import Progress
@@ -84,7 +84,7 @@ def parser() -> ArgumentParser:
                 default=[],
                 metavar="SENSOR=SECONDS",
                 help=(
-                    f"add this to the stamps of a sensor with another clock: {', '.join((*STREAMS, *SENSORS))}; "
+                    f"add this to the stamps of a sensor with another clock: {', '.join(STREAMS)}; "
                     "may be repeated"
                 ),
             ),
@@ -150,17 +150,17 @@ def _suggest(args: Namespace) -> None:
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
-    streams, offsets = (*STREAMS, *SENSORS), {}
+    offsets: dict[str, float] = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
         try:
             offset = float(seconds)
         except ValueError:
             offset = math.nan
-        if not given or sensor not in streams or sensor in offsets or not abs(offset) < 1e11:
+        if not given or sensor not in STREAMS or sensor in offsets or not abs(offset) < 1e11:
             raise InputError(
                 f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one "
-                f"of {', '.join(streams)}."
+                f"of {', '.join(STREAMS)}."
             )
         offsets[sensor] = offset
     return offsets

@@ -165,9 +165,7 @@ def _judged(
     from .. import debiasing
 
     flown = parallel.over(estimator, recordings, args.jobs, args.dask)
-    return debiasing.comparison_rows(
-        debiasing.require_anchors(flown, made), made, estimator.effects
-    )
+    return debiasing.comparison_rows(flown, made, estimator.effects)
 
 
 def _write(path: str | Path | None, figures: dict[str, Any]) -> None:

@@ -49,11 +49,11 @@ class GraphBuilder:
         self._constants: list[TensorProto] = []
         self.input, self._output, self._opset = input_name, output_name, OPSET
 
-    def constant(self, value: ArrayLike, kind: type[np.generic] = np.float32) -> str:
-        """Add a constant tensor."""
-        self._constants.append(
-            numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}")
-        )
+    def constant(self, value: ArrayLike) -> str:
+        """Add a constant tensor: of whole numbers, or of float."""
+        numbers = np.asarray(value)
+        numbers = numbers.astype(np.int64 if numbers.dtype.kind == "i" else np.float32)
+        self._constants.append(numpy_helper.from_array(numbers, f"c{len(self._constants)}"))
         return self._constants[-1].name
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> str:
@@ -83,25 +83,13 @@ class GraphBuilder:
         self._nodes.extend(inside.node)
         return inside.output[0].name
 
-    def whole(self, *numbers: int) -> str:
-        """Add a constant tensor of whole numbers."""
-        return self.constant(numbers, np.int64)
-
-    def take(self, value: str, columns: Iterable[int]) -> str:
-        """Select columns."""
-        return self.op("Gather", value, self.whole(*columns), axis=1)
-
     def joined(self, values: Sequence[str]) -> str:
         """Join the columns of tensors."""
         return self.op("Concat", *values, axis=1) if len(values) > 1 else values[0]
 
-    def reshaped(self, value: str, *shape: int) -> str:
-        """Reshape; 0 keeps the length of an axis."""
-        return self.op("Reshape", value, self.whole(*shape))
-
     def row_sum(self, value: str) -> str:
         """Sum along each row: (n, 1)."""
-        return self.op("ReduceSum", value, self.whole(1), keepdims=1)
+        return self.op("ReduceSum", value, [1], keepdims=1)
 
     def model(self, width: int, outputs: int, meta: Mapping[str, Any]) -> ModelProto:
         """Return the ONNX model whose last operator gives the output, (n, outputs).
@@ -273,7 +261,8 @@ class _Printer:
         starts = dict(zip(tensors, np.cumsum([0, *widths]).tolist()))
         name = self._graph.joined(tensors)
         index = [starts[tensor] + column for tensor, column in found]
-        return name if index == list(range(sum(widths))) else self._graph.take(name, index)
+        is_whole = index == list(range(sum(widths)))
+        return name if is_whole else self._graph.op("Gather", name, index, axis=1)
 
     def _leaves(self) -> str:
         """Find inputs and constants; return whether the anchors are two known ones, (n, 1)."""
@@ -286,19 +275,20 @@ class _Printer:
         self._keep(graph.input, len(INPUTS), columns)
         if leaves["constant"]:
             row = [[self._scalars[place].value for place in leaves["constant"]]]
-            never = graph.op("Equal", graph.take(graph.input, [0]), [-1.0])
+            never = graph.op("Equal", graph.op("Gather", graph.input, [0], axis=1), [-1.0])
             self._keep_all(graph.op("Where", never, row, row), leaves["constant"])
         ids = self._traced.anchors.ids.astype(float)[None]
         hits = {}
         for end in "ab":
-            is_here = graph.op("Equal", graph.take(graph.input, [COLUMN[f"anchor_{end}"]]), ids)
+            of_end = graph.op("Gather", graph.input, [COLUMN[f"anchor_{end}"]], axis=1)
+            is_here = graph.op("Equal", of_end, ids)
             hits[end] = graph.op("Where", is_here, [1.0], [0.0])
             values = [self._scalars[place].value[1] for place in leaves[end]]
             self._look_up(hits[end], leaves[end], values)
         if leaves["pair"]:
-            first = graph.reshaped(hits["a"], 0, count, 1)
-            second = graph.reshaped(hits["b"], 0, 1, count)
-            both = graph.reshaped(graph.op("Mul", first, second), 0, count**2)
+            first = graph.op("Reshape", hits["a"], [0, count, 1])  # 0 keeps the length of an axis
+            second = graph.op("Reshape", hits["b"], [0, 1, count])
+            both = graph.op("Reshape", graph.op("Mul", first, second), [0, count**2])
             values = [self._scalars[place].value for place in leaves["pair"]]
             self._look_up(both, leaves["pair"], values)
         found = graph.op("Mul", *map(graph.row_sum, hits.values()))
@@ -334,13 +324,13 @@ class _Printer:
     def _pieces(self, pieces: Pieces, x: str) -> str:
         """Return the sum of what a function gains in each of its pieces."""
         graph, breaks = self._graph, np.array(pieces.breaks)
-        above = graph.op("Sub", graph.reshaped(x, 0, -1, 1), breaks[:-1])
+        above = graph.op("Sub", graph.op("Reshape", x, [0, -1, 1]), breaks[:-1])
         inside = graph.op("Min", graph.op("Max", above, [0.0]), np.diff(breaks))
         _, *first, last = np.array(pieces.table).T
         value = graph.op("Mul", inside, last)
         for power in first[::-1]:
             value = graph.op("Mul", graph.op("Add", value, power), inside)
-        return graph.op("ReduceSum", value, graph.whole(2), keepdims=0)
+        return graph.op("ReduceSum", value, [2], keepdims=0)
 
     def _atan2(self, y: str, x: str) -> str:
         """Return the angle in all quadrants; the sign of a zero counts, as in numpy."""

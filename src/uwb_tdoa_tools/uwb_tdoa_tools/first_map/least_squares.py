@@ -10,7 +10,6 @@ many points.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -53,44 +52,38 @@ class Layout:
         self.size = 5 * anchors + len(PER_FLIGHT) * flights
 
 
-@dataclass(frozen=True, eq=False)
-class Stage:
-    """What a least-squares problem uses.
-
-    inertial : whether accelerations hold; otherwise the path is only smooth
-    frame : whether coordinates and heights hold; otherwise the frame is arbitrary
-    wide : factor on the standard deviations of radio measurements and distances; more than 1
-        smooths the cost, for a search
-    """
-
-    inertial: bool = True
-    frame: bool = True
-    wide: float = 1.0
-
-
 class Problem:
-    """Observations under a Stage."""
+    """Observations, and what of them a fit uses."""
 
-    def __init__(self, seen: Observations, stage: Stage) -> None:
-        self.seen, self.stage = seen, stage
+    def __init__(
+        self, seen: Observations, inertial: bool = True, frame: bool = True, wide: float = 1.0
+    ) -> None:
+        """Weigh the Observations.
+
+        inertial : whether accelerations hold; otherwise the path is only smooth
+        frame : whether coordinates and heights hold; otherwise the frame is arbitrary
+        wide : factor on the standard deviations of radio measurements and distances; more than 1
+            smooths the cost, for a search
+        """
+        self.seen = seen
         self.layout = Layout(len(seen.ids), seen.flights)
         self.bins = len(seen.t)
         self.two = seen.two
         self.first = np.where(self.two, seen.a, 0)
-        self.std = seen.std * stage.wide * (LASTING if stage.frame else 1.0)
+        self.std = seen.std * wide * (LASTING if frame else 1.0)
         self.middle = seen.middle
         known = np.isfinite(seen.accel[self.middle]).all(axis=1)
-        self.measured = known & stage.inertial
+        self.measured = known & inertial
         self.accel = np.where(self.measured[:, None], np.nan_to_num(seen.accel[self.middle]), 0.0)
         self.motion_weight = np.where(self.measured, ACCEL_STD, MOTION) ** -2.0
         self.accel_weight = np.where(self.measured, self.motion_weight, 0.0)
         self.of_flight = self.layout.of_flights[seen.flight]
-        self.high = np.flatnonzero(np.isfinite(seen.height) & stage.frame)
+        self.high = np.flatnonzero(np.isfinite(seen.height) & frame)
         ends = seen.distances[:, :2].astype(int)
         self.ends = ends[:, 0], ends[:, 1]
-        self.distance_std = seen.distances[:, 3] * stage.wide
+        self.distance_std = seen.distances[:, 3] * wide
         row, axis = seen.coordinates[:, :2].astype(int).T
-        self.coordinates = 3 * row + axis if stage.frame else np.zeros(0, int)
+        self.coordinates = 3 * row + axis if frame else np.zeros(0, int)
         self.prior = np.empty(self.layout.size)
         self.prior[self.layout.positions] = ANYWHERE**-2.0
         self.prior[self.layout.delays] = DELAY**-2.0
@@ -428,7 +421,7 @@ def minima(
     and reflections of the best fit so far, are a starting point of a fit in the frame.
     """
     shapes, reached = _shapes(seen, rng, progress)
-    wide, exact = (Problem(seen, Stage(wide=wide)) for wide in WIDTHS[1:])
+    wide, exact = (Problem(seen, wide=wide) for wide in WIDTHS[1:])
     fits: list[Fit] = []
 
     def fit_from(path: np.ndarray, columns: np.ndarray) -> None:
@@ -465,7 +458,7 @@ def _shapes(
     seen: Observations, rng: np.random.Generator, progress: Callable[[str], object]
 ) -> tuple[list[Fit], int]:
     """Return distinct shapes, best first, and how many starting points reached the best."""
-    problems = [Problem(seen, Stage(False, False, wide)) for wide in WIDTHS]
+    problems = [Problem(seen, False, False, wide) for wide in WIDTHS]
     fits: list[Fit] = []
     reached = 0
     for number, distances in enumerate(_distances(seen, rng)):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 
 from ..choices import MAP_ACCURACY
 from .least_squares import (
@@ -27,7 +26,6 @@ from .least_squares import (
     Equations,
     Fit,
     Problem,
-    Stage,
     minima,
     misfit_of,
     rigid_distance,
@@ -186,7 +184,7 @@ def map_anchors(
     fits, reached = minima(seen, rng, progress)
     progress("estimating how far the map can be off")
     best = fits[0]
-    linear = Problem(seen, Stage()).about(best)
+    linear = Problem(seen).about(best)
     spread, lasting = covariance(linear, best, rng)
     apart = SAME_MAP + BEYOND * np.sqrt(np.diag(spread)).reshape(-1, 3)
     near = [
@@ -342,7 +340,7 @@ def _unchecked(found: FirstMap, seen: Observations, best: Fit, accuracy: float) 
         return ""
     for number, (a, b, *_) in enumerate(seen.distances):
         fewer = replace(seen, distances=np.delete(seen.distances, number, axis=0))
-        about = Problem(fewer, Stage()).about(best)
+        about = Problem(fewer).about(best)
         std = np.sqrt(np.diag(about.covariance)[: found.positions.size]).reshape(-1, 3)
         if np.linalg.norm(std, axis=1).max() > accuracy:
             one, other = found.ids[[int(a), int(b)]]
@@ -417,4 +415,4 @@ def picture(found: FirstMap, path: str | Path) -> None:
             ax.annotate(str(i), (place[0], place[1]), textcoords="offset points", xytext=(6, 6))
     state = f"not accepted; red: {len(found.others)} other maps" if found.why_not else "accepted"
     figure.suptitle(f"first map: {state}; squares: trusted; ellipses: 95 %")
-    write_filled(path, partial(figure.savefig, dpi=110))
+    write_picture(path, figure)

@@ -113,7 +113,7 @@ def found_in_words(diagnosis: Diagnosis) -> list[str]:
 
 def recordings_in_words(flights: Sequence[Flight], seed: int) -> str:
     """Return what was recorded, and where its ground truth is from."""
-    seconds = sum(round(flight.end - flight.start) for flight in flights)
+    seconds = sum(round(flight.duration) for flight in flights)
     count = sum(len(flight.tdoa) for flight in flights)
     return (
         f"{listed(flight.name for flight in flights)} in hall {seed}: {seconds} s, {count} TDOAs of "

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled, write_picture
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
 from uwb_tdoa_ekf.monitoring.finding import ERROR
@@ -364,7 +364,8 @@ class Localizer:
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         write_trajectory(path(".csv"), odometry)
         title = f"{name}: {assessment.sentences()[0].partition(';')[0]}"
-        pictures.draw_estimate(path(".png"), odometry, flight.anchors, assessment.lost, title)
+        figure = pictures.estimate_figure(odometry, flight.anchors, assessment.lost, title)
+        write_picture(path(".png"), figure)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path("_bag"), force=True)
         if self.residuals:

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.files import write_filled, write_text
+from uwb_tdoa_bias.common.files import write_picture, write_text
 from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_ekf.core.memory import USED
 from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals
@@ -154,7 +153,7 @@ def draw_residuals(path: Path, residuals: Residuals, title: str) -> None:
         ),
         fontsize=10,
     )
-    write_filled(path, partial(figure.savefig, dpi=110))
+    write_picture(path, figure)
 
 
 @dataclass(frozen=True)
@@ -268,7 +267,7 @@ def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, tit
         figure.colorbar(mesh, ax=ax, label=label)
     axes[0].legend(loc="best")
     figure.suptitle(title, fontsize=10)
-    write_filled(path, partial(figure.savefig, dpi=110))
+    write_picture(path, figure)
     plt.close(figure)
 
 
@@ -283,18 +282,6 @@ BLUE, RED, GREY, BLACK, ORANGE = (
     (40, 40, 40),
     (255, 127, 14),
 )
-
-
-def draw_estimate(
-    path: Path,
-    odometry: Odometry,
-    anchors: Anchors,
-    spans: Sequence[tuple[float, float]],
-    title: str,
-) -> None:
-    """Write the `estimate_figure` of an Odometry to an image file."""
-    figure = estimate_figure(odometry, anchors, spans, title)
-    write_filled(path, partial(figure.savefig, dpi=110))
 
 
 def estimate_figure(

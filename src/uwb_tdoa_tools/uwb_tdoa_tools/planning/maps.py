@@ -33,7 +33,6 @@ from ..checking.coverage import sides_of
 from ..choices import ACCURACY
 from ..parallel import Progress
 from ..scoring.evaluation import evaluate
-from ..scoring.metrics import position_at
 from ..simulation.config import Room, Walls, facing, heard_at
 from .precision import (
     CLEAR,
@@ -247,9 +246,8 @@ def error_samples(flight: Flight, sensors: Iterable[str] = ()) -> ErrorSamples:
 
     The filter uses TDOAs, IMU and `sensors` (names of SENSOR_NAMES) alone.
     """
-    assert flight.truth is not None
     score, _ = evaluate(flight.without(*(name for name in SENSOR_NAMES if name not in sensors)))
-    return ErrorSamples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
+    return ErrorSamples(score.t, score.p, score.error, score.covariance)
 
 
 def pooled(samples: Sequence[ErrorSamples]) -> ErrorSamples:
@@ -531,7 +529,7 @@ def design(
         )
     layouts, more = _without_spare_anchors(hall, points, share, anchors, progress)
     progress("directions of the anchors")
-    turned = [_with_best_yaws(quick, points, each) for each in layouts[:2]]
+    turned = [_turned(quick, points, each) for each in layouts[:2]]
     return turned + layouts[2:], _best_steps(steps + more)
 
 
@@ -669,29 +667,25 @@ def _moved(quick: Hall, points: np.ndarray, anchors: Anchors, row: int) -> Ancho
     return at(found.x) if found.fun < cost(start) else anchors
 
 
-def _with_best_yaws(quick: Hall, points: np.ndarray, anchors: Anchors) -> Anchors:
-    """Return Anchors, each turned about the vertical to the least cost."""
+def _turned(quick: Hall, points: np.ndarray, anchors: Anchors) -> Anchors:
+    """Return Anchors, each turned about the vertical to the least cost, one after the other."""
     for row in range(len(anchors)):
-        anchors = _turned(quick, points, anchors, row)
+        now = quick.with_anchors(anchors).everywhere(points)
+
+        def at(yaw: float) -> Anchors:
+            orientations = anchors.orientations.copy()
+            orientations[row] = Rotation.from_euler("z", yaw, degrees=True).as_quat().round(4)
+            return Anchors(anchors.ids, anchors.positions, orientations, anchors.frame)
+
+        def cost(yaw: float) -> float:
+            judged = quick.changed(now, points, at(yaw), anchors.positions[[row]])
+            return _cost_of(judged, quick)
+
+        options = {"maxiter": TURNS}
+        found = minimize_scalar(cost, bounds=(-180.0, 180.0), method="bounded", options=options)
+        if found.fun < _cost_of(now, quick):
+            anchors = at(round(float(found.x)))
     return anchors
-
-
-def _turned(quick: Hall, points: np.ndarray, anchors: Anchors, row: int) -> Anchors:
-    """Return Anchors with one turned about the vertical to the least cost."""
-    now = quick.with_anchors(anchors).everywhere(points)
-
-    def at(yaw: float) -> Anchors:
-        orientations = anchors.orientations.copy()
-        orientations[row] = Rotation.from_euler("z", yaw, degrees=True).as_quat().round(4)
-        return Anchors(anchors.ids, anchors.positions, orientations, anchors.frame)
-
-    def cost(yaw: float) -> float:
-        judged = quick.changed(now, points, at(yaw), anchors.positions[[row]])
-        return _cost_of(judged, quick)
-
-    options = {"maxiter": TURNS}
-    found = minimize_scalar(cost, bounds=(-180.0, 180.0), method="bounded", options=options)
-    return at(round(float(found.x))) if found.fun < _cost_of(now, quick) else anchors
 
 
 def placements(anchors: Anchors) -> list[dict[str, Any]]:

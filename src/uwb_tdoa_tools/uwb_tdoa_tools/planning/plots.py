@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 
 from ..scoring.plots import draw_labels
 from ..simulation.config import Walls
@@ -65,7 +64,7 @@ def plot_precision(
     _bar(axes, mesh, "bound of one round, cm", 100.0 * chart.error)
     label = "99 % of the estimates" + (f", {times} times as large" if times > 1 else "")
     ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=label)
-    marks = [_hull_line(), _anchor_mark(anchors), ellipse]
+    marks = [*_anchor_marks(anchors), ellipse]
     _finish(figure, "How precise one round is", marks, dict.fromkeys(axes, anchors), path)
 
 
@@ -97,7 +96,7 @@ def plot_flyable(
         name, colour = STATES[code]
         label = f"{name}: {100.0 * np.mean(chart.status == code):.0f} %"
         marks.append(Patch(facecolor=colour, label=label))
-    marks += [_hull_line(), _anchor_mark(anchors)]
+    marks += _anchor_marks(anchors)
     if pairings is not None:
         label = "bifurcation curve of a choice of anchors"
         marks.append(Line2D([], [], color="0.45", lw=0.8, label=label))
@@ -129,7 +128,7 @@ def plot_heard(
     share = f"{100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more"
     ax.set_title(f"{_height(chart.grid, k)}: {share}", fontsize=10)
     title = f"How many of {len(anchors)} anchors are heard"
-    _finish(figure, title, [_hull_line(), _anchor_mark(anchors)], {ax: anchors}, path)
+    _finish(figure, title, _anchor_marks(anchors), {ax: anchors}, path)
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
@@ -162,7 +161,7 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
         ax.label_outer()
     _bar(axes.ravel(), mesh, "3D, cm", every)
     title = "Measured error beside what is claimed and what is possible"
-    _finish(figure, title, [_hull_line(), _anchor_mark(anchors)], {}, path)
+    _finish(figure, title, _anchor_marks(anchors), {}, path)
 
 
 def plot_layouts(
@@ -193,8 +192,7 @@ def plot_layouts(
         )
     _bar(axes, mesh, "bound of one round, cm", errors)
     marks: list[Any] = [
-        _hull_line(),
-        _anchor_mark(charts[0][1].anchors),
+        *_anchor_marks(charts[0][1].anchors),
         Patch(fill=False, ec="r", label="where it is flown"),
     ]
     if blocked:
@@ -310,12 +308,6 @@ def _room(ax: Axes, anchors: Anchors, grid: Grid, walls: Walls | None = None) ->
     left, bottom = near.min(axis=0) - margin
     right, top = near.max(axis=0) + margin
     ax.set(xlim=(left, right), ylim=(bottom, top))
-    _hull(ax, anchors)
-    _anchors(ax, anchors)
-
-
-def _hull(ax: Axes, anchors: Anchors) -> None:
-    above = anchors.positions[:, :2]
     if len(anchors) > 2 and np.linalg.matrix_rank(above - above[0], 1e-6) == 2:
         corners = ConvexHull(above).vertices
         ax.plot(
@@ -327,29 +319,22 @@ def _hull(ax: Axes, anchors: Anchors) -> None:
             scaley=False,
             path_effects=[withStroke(linewidth=2.4, foreground="w")],
         )
-
-
-def _anchors(ax: Axes, anchors: Anchors) -> None:
-    p = anchors.positions
-    size = float(np.clip(60.0 / np.sqrt(len(anchors)), 4.0, 8.0))
     ax.plot(
-        p[:, 0],
-        p[:, 1],
+        *above.T,
         "^",
         color=ANCHOR,
         mec="w",
         mew=0.6,
-        ms=size,
+        ms=float(np.clip(60.0 / np.sqrt(len(anchors)), 4.0, 8.0)),
         zorder=5,
         scalex=False,
         scaley=False,
     )
     oriented = np.isfinite(anchors.orientations).all(axis=1)
     if oriented.any():
-        front = _directions(anchors)[oriented]
         ax.quiver(
-            *p[oriented, :2].T,
-            *front.T,
+            *above[oriented].T,
+            *_directions(anchors)[oriented].T,
             color=ANCHOR,
             width=0.005,
             scale=_ARROWS_ACROSS,
@@ -369,20 +354,14 @@ def _directions(anchors: Anchors) -> np.ndarray:
     return out
 
 
-def _points_on_arrows(ax: Axes, anchors: Anchors) -> np.ndarray:
-    """Return the middles and tips of the arrows of `_anchors`, that labels avoid: (2 n, 2) m."""
-    arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / _ARROWS_ACROSS
-    return np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
-
-
-def _hull_line() -> Line2D:
-    return Line2D([], [], color=HULL, lw=1.2, ls="--", label="hull of the anchors")
-
-
-def _anchor_mark(anchors: Anchors) -> Line2D:
+def _anchor_marks(anchors: Anchors) -> list[Line2D]:
+    """Return the marks of the hull and of the anchors for a legend."""
     oriented = np.isfinite(anchors.orientations).all(axis=1).any()
     label = "anchor, arrow: its front" if oriented else "anchor"
-    return Line2D([], [], color=ANCHOR, marker="^", ls="", label=label)
+    return [
+        Line2D([], [], color=HULL, lw=1.2, ls="--", label="hull of the anchors"),
+        Line2D([], [], color=ANCHOR, marker="^", ls="", label=label),
+    ]
 
 
 def _some_cells(chart: Chart, k: int) -> np.ndarray:
@@ -444,7 +423,9 @@ def _finish(
     figure.set_dpi(DPI)
     figure.draw_without_rendering()  # labels need the final layout
     for ax, anchors in labelled.items():
-        avoided = _points_on_arrows(ax, anchors)
+        arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / _ARROWS_ACROSS
+        # labels avoid the middles and the tips of the arrows
+        avoided = np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
         draw_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], avoided, ANCHOR)
-    write_filled(path, partial(figure.savefig, dpi=DPI))
+    write_picture(path, figure, DPI)
     plt.close(figure)

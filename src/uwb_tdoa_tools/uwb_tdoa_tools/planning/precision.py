@@ -35,7 +35,6 @@ definition, not of the search.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 import math
@@ -186,51 +185,8 @@ def antenna_from_yaml(path: str | Path) -> Antenna:
         ) from error
 
 
-@dataclass(frozen=True)
-class Pairing:
-    """TDOAs or ranges of one round, measured independently of its other Pairings.
-
-    Attributes
-    ----------
-    a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
-    shared : True if the TDOAs of a round share one reception per anchor, and its error. False if
-        their errors are independent.
-    times : number of times that each TDOA comes in a round (default 1)
-    ranges : True for distances to the anchors of `a`, once a round
-    """
-
-    a: np.ndarray
-    b: np.ndarray
-    shared: bool
-    times: float = 1.0
-    ranges: bool = False
-
-
-def ring(n: int) -> Pairing:
-    """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
-    return Pairing(np.arange(n), (np.arange(n) + 1) % n, True)
-
-
-def all_pairs(n: int) -> Pairing:
-    """Return the TDOAs of TDOA3: each anchor with each other, with independent errors.
-
-    A round counts as N TDOAs.
-    """
-    a, b = np.triu_indices(n, 1)
-    return Pairing(a, b, False, 2.0 / (n - 1))
-
-
-def every_range(n: int) -> Pairing:
-    """Return the N distances of two-way ranging."""
-    return Pairing(np.arange(n), np.arange(n), False, ranges=True)
-
-
-# Parts of a round, by the words of choices.OF_PROTOCOL
-PARTS: dict[str, Callable[[int], Pairing]] = {
-    "ring": ring,
-    "all_pairs": all_pairs,
-    "every_range": every_range,
-}
+# Parts of a round, by the words of choices.OF_PROTOCOL. The errors of two parts are independent.
+RING, ALL_PAIRS, EVERY_RANGE = "ring", "all_pairs", "every_range"
 
 
 SAME_PLACE = 0.01  # m; two anchors nearer than this are one
@@ -255,7 +211,7 @@ class Installation:
 
     anchors: Anchors
     noise: RadioNoise | FixedNoise = field(default_factory=RadioNoise)
-    pairing: str = "ring"
+    pairing: str = RING
     dimensions: int = 3
     height_std: float = np.inf
     hall: bool = False
@@ -274,9 +230,10 @@ class Installation:
         """Return a copy for a hall with other Anchors."""
         return replace(self, anchors=anchors, hall=True)
 
-    def round(self, heard: int) -> list[Pairing]:
-        """Return the parts of a round of so many anchors, measured independently."""
-        return [PARTS[name](heard) for name in self.pairing.split("+")]
+    @property
+    def parts(self) -> list[str]:
+        """The parts of a round, measured independently."""
+        return self.pairing.split("+")
 
     @property
     def unknowns(self) -> int:
@@ -386,7 +343,7 @@ def _information(
         gradient = variance_gradient(installation.noise, points, anchors, variances, k)
         gradient = np.take_along_axis(gradient, columns[..., None], axis=1)
     total = np.zeros((len(points), k, k))
-    for part in installation.round(columns.shape[1]):
+    for part in installation.parts:
         weights = range_weights(variance, part)
         total += weigh(unit, weights)
         if correction:
@@ -405,48 +362,55 @@ def weigh(change: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def round_weights(variance: np.ndarray, installation: Installation) -> np.ndarray:
     """Return the weights of the ranges in a whole round: (n, N, N) 1/m^2. variance : (n, N) m^2."""
-    parts = installation.round(variance.shape[1])
-    return np.sum([range_weights(variance, part) for part in parts], axis=0)
+    return np.sum([range_weights(variance, part) for part in installation.parts], axis=0)
 
 
-def range_weights(variance: np.ndarray, part: Pairing) -> np.ndarray:
+def range_weights(variance: np.ndarray, part: str) -> np.ndarray:
     """Return D' F^-1 D, the weights of the ranges in a part of a round: (n, N, N) 1/m^2.
 
     D (M, N) has -1 at anchor a and +1 at anchor b of each pair; it is the identity for ranges. F = D S D'
     is the covariance of the measurements, S = diag(variance).
 
-    If the anchors share one reception each and the pairs connect all of them, the result does not
+    RING : the N TDOAs of TDOA2, each anchor with the next one. Each TDOA shares a reception, and its
+    error, with its neighbours. If the pairs connect all anchors, the result does not
     depend on the pairs: with W = S^-1 and w its diagonal, D' (D S D')^-1 D = W - w w' / sum(w).
     That is the information of N ranges with one unknown offset, the tag's clock. A closed ring,
-    whose D S D' is singular, has the same information. Only independent TDOAs have `times`.
+    whose D S D' is singular, has the same information.
+    ALL_PAIRS : the TDOAs of TDOA3, each anchor with each other, with independent errors. A round
+    counts as N TDOAs.
+    EVERY_RANGE : the N distances of two-way ranging.
 
-    variance : (n, N) m^2, of the receptions; part : Pairing
+    variance : (n, N) m^2, of the receptions
     Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
     """
     each = np.eye(variance.shape[1])
-    if part.ranges:
+    if part == EVERY_RANGE:
         return each / variance[:, None]
-    if part.shared:
+    if part == RING:
         w = 1.0 / variance
         return each * w[:, None] - w[:, :, None] * (w / w.sum(axis=1, keepdims=True))[:, None]
-    between = np.zeros((len(variance), *each.shape))
-    between[:, part.a, part.b] = part.times / (variance[:, part.a] + variance[:, part.b])
-    between += between.swapaxes(1, 2)
+    of_pair = variance[:, :, None] + variance[:, None, :]
+    between = (1.0 - each) * (_times(len(each)) / of_pair)
     return each * between.sum(axis=1)[:, None] - between
 
 
-def _weights_of_sizes(weights: np.ndarray, part: Pairing) -> np.ndarray:
+def _times(n: int) -> float:
+    """Return how often each of ALL_PAIRS of n anchors comes in a round, which counts as n TDOAs."""
+    return 2.0 / (n - 1)
+
+
+def _weights_of_sizes(weights: np.ndarray, part: str) -> np.ndarray:
     """Return the weights of the variances in the second term of eq. 1, times 2: (n, N, N) 1/m^4.
 
     weights : P, of `range_weights`. With dF_i = D diag(g_i) D', the trace of eq. 1 is g_i' (P o P)
     g_j. If the errors are independent, F is diagonal, and a pair adds (g_a + g_b)^2 / F^2.
     """
     squared = weights**2
-    if part.shared or part.ranges:
+    if part != ALL_PAIRS:
         return squared
     each = np.eye(weights.shape[1])
     squared *= 1.0 - each
-    return (squared + each * squared.sum(axis=1)[:, None]) / part.times
+    return (squared + each * squared.sum(axis=1)[:, None]) / _times(len(each))
 
 
 def bound(information: np.ndarray) -> np.ndarray:
@@ -541,7 +505,8 @@ class Subsets:
         out = np.empty((len(points), size))
         at = 0
         for chunk in np.array_split(points, max(1, len(points) * size * k // _OF_PLACES)):
-            q = _distances(chunk, self.anchors.positions) @ matrix
+            away = np.linalg.norm(chunk[:, None] - self.anchors.positions, axis=-1)
+            q = away @ matrix
             out[at : at + len(chunk)] = (
                 np.einsum("nqk,nqk->nq", *[q.reshape(len(chunk), size, k)] * 2) - 1.0
             )
@@ -551,10 +516,6 @@ class Subsets:
     def ambiguous(self, points: np.ndarray) -> np.ndarray:
         """Return the share of the subsets with two solutions: (n,)."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
-
-
-def _distances(points: np.ndarray, anchors: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(points[:, None] - anchors, axis=-1)
 
 
 def _choices(n: int, k: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,7 +61,7 @@ def plan(args: Namespace) -> bool:
         cli.show("anchors without orientation are taken to radiate alike in all directions")
     report.print_room(room, args.room is not None)
     args.out.mkdir(parents=True, exist_ok=True)
-    figures: dict[str, Any] = {"arguments": as_json(args)}
+    figures: dict[str, Any] = {"arguments": vars(args)}
     if anchors is None:
         whole, found, figures["design"] = designed(args, whole, grid)
     else:
@@ -89,9 +89,10 @@ def plan(args: Namespace) -> bool:
         figures["flights"] = evaluate_flights(flown, installation, room, step, args.out)
         report.print_flights(figures["flights"])
     if aim:
-        figures["improve"] = improve(found, aim, args.starts, args.out)
+        figures["improve"] = improve(found, *aim, args.starts, args.out)
         report.print_improvement(figures["improve"])
-    end(args, figures)
+    cli.write_json(args.out / "plan.json", figures)
+    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
     return bool(found.flyable.mean() >= args.share) or not args.hall
 
 
@@ -212,22 +213,12 @@ def grid_of(args: Namespace, room: Room) -> Grid:
     return Grid.slice((room.lower[0], room.upper[0]), (room.lower[1], room.upper[1]), height, step)
 
 
-@dataclass(frozen=True)
-class Aim:
-    """What --improve asks for.
+def aim_of(
+    args: Namespace, installation: Installation, demand: Demand, height: float
+) -> tuple[Goal, Goal, AnchorPlaces, int]:
+    """Return what --improve asks for. Raises InputError.
 
-    goal : Goal of the search; reported : Goal at more points, for the report; places : AnchorPlaces;
-    count : number of anchors.
-    """
-
-    goal: Goal
-    reported: Goal
-    places: AnchorPlaces
-    count: int
-
-
-def aim_of(args: Namespace, installation: Installation, demand: Demand, height: float) -> Aim:
-    """Return the Aim of --improve. Raises InputError.
+    It is a Goal of the search, one at more points for the report, the places of anchors, and their number.
 
     height : m, of the flown slice if the tag's height is known.
     """
@@ -242,11 +233,10 @@ def aim_of(args: Namespace, installation: Installation, demand: Demand, height: 
     lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
     lower[k:] = upper[k:] = height
     step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))
-
-    def goal(step: float) -> Goal:
-        return Goal(lattice(lower, upper, step), installation, demand)
-
-    return Aim(goal(step), goal(0.4 * step), places_of(args, demand.room), count)
+    goal, reported = (
+        Goal(lattice(lower, upper, each), installation, demand) for each in (step, 0.4 * step)
+    )
+    return goal, reported, places_of(args, demand.room), count
 
 
 def places_of(args: Namespace, room: Room) -> AnchorPlaces:
@@ -256,13 +246,6 @@ def places_of(args: Namespace, room: Room) -> AnchorPlaces:
         if args.places
         else AnchorPlaces.walls(room.lower, room.upper)
     )
-
-
-def as_json(args: Namespace) -> dict[str, Any]:
-    """Return the options as JSON values."""
-    return {
-        name: str(value) if isinstance(value, Path) else value for name, value in vars(args).items()
-    }
 
 
 def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, Chart, list[dict[str, Any]]]:
@@ -304,14 +287,6 @@ def advice(args: Namespace, whole: Hall, found: Chart) -> dict[str, Any] | None:
         tried = np.unique(places.positions(places.grid(PLACES_TRIED)).round(2), axis=0)
     with Progress("plan") as progress:
         return optimisation.best_addition(whole, found, tried, progress)
-
-
-def end(args: Namespace, figures: dict[str, Any]) -> None:
-    """Write the figures, and print the names of the files."""
-    for path in (args.out / "plan.json", args.json):
-        if path is not None:
-            cli.write_json(path, figures)
-    cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 
 
 def draw_map(whole: Hall, found: Chart, out: Path) -> None:
@@ -365,17 +340,24 @@ def evaluate_flights(
     return rows
 
 
-def improve(before: Chart, aim: Aim, starts: int, out: Path) -> dict[str, Any]:
+def improve(
+    before: Chart,
+    goal: Goal,
+    reported: Goal,
+    places: AnchorPlaces,
+    count: int,
+    starts: int,
+    out: Path,
+) -> dict[str, Any]:
     """Search better places for the anchors, and write improved.yaml.
 
-    before : Chart with the anchors as they are; aim : Aim.
+    before : Chart with the anchors as they are; goal, reported, places, count : of `aim_of`.
     """
-    goal, places, installation = aim.goal, aim.places, aim.goal.installation
-    anchors = installation.anchors
+    installation, anchors = goal.installation, goal.installation.anchors
     with Progress("plan") as progress:
-        start = anchors.positions if aim.count == len(anchors) else None
+        start = anchors.positions if count == len(anchors) else None
         over = partial(progress.over, what="layouts")
-        found = optimisation.optimise(goal, places, aim.count, start, starts, over)
+        found = optimisation.optimise(goal, places, count, start, starts, over)
         better = optimisation.rounded(optimisation.with_old_ids(found, anchors), anchors)
         better.to_yaml(out / "improved.yaml")
         after = Hall(replace(installation, anchors=better), goal.demand)
@@ -386,11 +368,11 @@ def improve(before: Chart, aim: Aim, starts: int, out: Path) -> dict[str, Any]:
             out / "layout.png",
         )
     judged = {
-        when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
+        when: {"flyable_share": float(one.flyable.mean()), **reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))
     }
     return {
-        "points": len(aim.reported.points),
+        "points": len(reported.points),
         **judged,
         "placed": optimisation.placements(better, anchors),
     }

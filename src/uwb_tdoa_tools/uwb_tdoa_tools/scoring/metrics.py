@@ -5,33 +5,27 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.effects.samples import PoseColumns
 from uwb_tdoa_ekf.core.memory import COMPENSATED, REJECTED, USED
+from uwb_tdoa_ekf.offline import Run
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from ..choices import ALIGN
 from ..cli import as_json
 from .phases import TITLES, in_the_air, motion, phases
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight, Truth
-    from uwb_tdoa_ekf.offline import Run
-
-    Spans = Sequence[tuple[float, float]]  # from when to when, s
-
-
+Spans = Sequence[tuple[float, float]]  # from when to when, s
 # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
 Errors = dict[str, dict[float | None, float]]
 

@@ -4,26 +4,17 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.flight import Truth
 
+from .metrics import Estimate, Score
 from .phases import TITLES
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
-
-    from matplotlib.axes import Axes
-
-    from uwb_tdoa_bias.common.flight import Truth
-
-    from .metrics import Estimate, Score
 
 SHADES = {  # of phases that follow one another
     "at_rest_earlier": "0.9",
@@ -43,11 +34,6 @@ _POINT_CLEARANCE = 3.0  # pt, between a label and all points that it avoids
 # Costs of a place for a label, in px^2 of another label that it covers
 _COST_OF_POINT = 50.0  # px^2 for each point that the label covers
 _COST_BEYOND_AXES = 20.0  # px^2 for each px that the label reaches beyond the axes
-
-
-def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path) -> None:
-    """Write the `error_figure` of a Score to an image file."""
-    write_filled(path, partial(error_figure(score, odometry, truth).savefig, dpi=110))
 
 
 def error_figure(score: Score, odometry: Estimate, truth: Truth) -> Figure:

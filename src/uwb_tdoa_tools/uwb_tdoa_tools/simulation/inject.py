@@ -9,26 +9,21 @@ of each kind, by the error without a correction.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 import re
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EFFECTS, Effect, SmoothTerm
 
 from ..bags.bag import check_output, write_bag
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flight import Flight
-
-    from ..readers.inputs import Reading
-
+from ..readers.inputs import Reading
 
 # anchors in the name of a parameter: 3, 3-5, 3.x
 _ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 import inspect
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 from uwb_tdoa_bias.common.flight import Flight
 
 from .config import CONSTELLATIONS, constellation
@@ -87,4 +86,4 @@ def plot(flight: Flight, path: str | Path) -> None:
     total = parts["bias"] + parts["multipath"] + parts["noise"] + parts["outlier"]
     error.plot(parts["t"], total, ".", markersize=1)
     error.set(xlabel="t, s", ylabel="error of TDOA, m", ylim=(-1, 1))
-    write_filled(path, partial(figure.savefig, dpi=120))
+    write_picture(path, figure, 120)

@@ -7,7 +7,6 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import TABLE_CELLS, InputError
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.effects import Effect, EffectSet
@@ -48,7 +47,7 @@ def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:
     entries = content.get("marks") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: expected a list 'marks', each as {MARK_EXAMPLE}.")
-    lengths = {flight.name: flight.end - flight.start for flight in flights}
+    lengths = {flight.name: flight.duration for flight in flights}
     return [
         _mark(f"{path}: mark {number}", entry, lengths)
         for number, entry in enumerate(entries, start=1)
@@ -364,7 +363,7 @@ def picture(found: SelfCalibration, path: str | Path) -> None:
                 xytext=(7, 7),
             )
     figure.axes[0].legend()
-    write_filled(path, partial(figure.savefig, dpi=110))
+    write_picture(path, figure)
 
 
 def with_blocked(

@@ -25,7 +25,7 @@ from sklearn.neural_network import MLPRegressor
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import temporary_folder, write_bytes, write_filled
+from uwb_tdoa_bias.common.files import temporary_folder, write_bytes, write_picture
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.model import ATTITUDE, FEATURES, Network, columns
@@ -531,7 +531,7 @@ def plot_curve(
     ax.set(xlabel=label, ylabel="error of the TDOAs, RMS [m]")
     ax.grid(alpha=0.3)
     ax.legend()
-    write_filled(path, partial(figure.savefig, dpi=110))
+    write_picture(path, figure)
     plt.close(figure)
 
 
