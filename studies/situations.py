@@ -20,7 +20,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.cli import as_json
-from uwb_tdoa_tools.scoring.metrics import READY, PooledErrors, Score
+from uwb_tdoa_tools.scoring.metrics import READY, Score, pooled_errors
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import corners, facing
 
@@ -116,23 +116,19 @@ def again(judged, since):
 def figures(results):
     """Pool the `measure` of several seeds.
 
-    Returns a dict as of `PooledErrors.figures`, with again_median, again_max, s, and never, the
+    Returns a dict as of `pooled_errors`, with again_median, again_max, s, and never, the
     number of seeds in which the filter is never right again.
     """
-    pool = PooledErrors()
-    for result in results:
-        pool.add(
-            {
-                name: math.nan if value is None else value
-                for name, value in result["figures"].items()
-            }
-        )
+    runs = [
+        {name: math.nan if value is None else value for name, value in result["figures"].items()}
+        for result in results
+    ]
     times = [result["again"] for result in results if result["again"] is not None]
     more = {
         "again_median": float(np.median(times)) if times else math.nan,
         "again_max": max(times, default=math.nan),
     }
-    return {**pool.figures(), **more, "never": len(results) - len(times)}
+    return {**pooled_errors(runs), **more, "never": len(results) - len(times)}
 
 
 COLUMNS = {

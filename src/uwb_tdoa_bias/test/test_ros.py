@@ -6,7 +6,6 @@ from dataclasses import replace
 from fractions import Fraction
 import time
 from types import SimpleNamespace
-from unittest.mock import Mock
 
 import pytest
 
@@ -406,7 +405,7 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     clock = other.create_publisher(Clock, "/clock", DEEP)
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
     assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
-    spinner = Spinner([node], StreamPoller([streams]))
+    spinner = Spinner([node], StreamPoller([streams.take]))
     spinner._serve()
     for second in range(1, MANY + 1):
         publisher.publish(FluidPressure())
@@ -435,7 +434,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     until(publisher.get_subscription_count)
     # The process sleeps in its executor until then.
     node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))
-    spinner = Spinner([node], StreamPoller([streams]))
+    spinner = Spinner([node], StreamPoller([streams.take]))
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 60.0
     spinner.close()
@@ -444,8 +443,8 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
 def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
     def rest(*streams):
         """Return the rest after a turn with streams (duration in s, whether anything arrived)."""
-        taking = [Mock(take=lambda one=one: time.sleep(one[0]) or one[1]) for one in streams]
-        return StreamPoller(taking).take()
+        takes = [lambda one=one: time.sleep(one[0]) or one[1] for one in streams]
+        return StreamPoller(takes).take()
 
     assert rest((0.0, False)) is None
     assert PERIOD <= rest((0.0, True), (0.0, False)) <= 0.01  # upper limit for a busy computer

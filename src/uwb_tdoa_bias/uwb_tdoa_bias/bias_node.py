@@ -182,7 +182,7 @@ class BiasNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = StreamPoller([self.streams])
+            self.turns = StreamPoller([self.streams.take])
         self.ready = f"ready; correcting with: {self._model_name}"
 
     @property

@@ -9,7 +9,6 @@ ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight_bag rate:=2 anchors_file:=anc
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from launch import LaunchDescription
 from launch.actions import (
@@ -19,12 +18,10 @@ from launch.actions import (
     Shutdown,
     TimerAction,
 )
+from launch.events.process import ProcessExited
+from launch.launch_context import LaunchContext
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
-
-if TYPE_CHECKING:
-    from launch.events.process import ProcessExited
-    from launch.launch_context import LaunchContext
 
 DELAY = "3"  # s until the nodes have been discovered: what is played before is lost
 REST = 2.0  # s after the end of the bag, in which the nodes publish what they still wait with

@@ -192,7 +192,7 @@ class EkfNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = StreamPoller([self.streams])
+            self.turns = StreamPoller([self.streams.take])
         self.ready = "ready"
 
     def _remark_height(self) -> None:

@@ -11,17 +11,14 @@ interpolation, Neural Computation 1992).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
-
-    from numpy.typing import ArrayLike
-
-    from uwb_tdoa_bias.effects.effect_set import Covariance
+from uwb_tdoa_bias.effects.effect_set import Covariance
 
 ChangeKey = tuple[str, int]  # effect, number of an anchor
 Change = tuple[np.ndarray, float]  # places (m,) among the unknowns, m, standard deviation

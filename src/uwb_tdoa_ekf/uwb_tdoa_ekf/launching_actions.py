@@ -4,12 +4,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 import os
 import time
-from typing import TYPE_CHECKING
 
 from ament_index_python.packages import get_package_share_directory
+from launch.action import Action
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, TimerAction
+from launch.events.process import ProcessExited
+from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
 import launch.logging
 from launch.substitutions import LaunchConfiguration
@@ -19,13 +22,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.executable import leave_present_folder_out
 
 from .launching import LAUNCH_FILES, Lives, Start, discovery, network
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
-
-    from launch.action import Action
-    from launch.events.process import ProcessExited
-    from launch.launch_context import LaunchContext
 
 
 def description(name: str) -> LaunchDescription:

@@ -82,7 +82,7 @@ class LocalizationNode(StreamNode):
             raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = StreamPoller(self._tags)
+        self.turns = StreamPoller([each.take for each in self._tags])
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 

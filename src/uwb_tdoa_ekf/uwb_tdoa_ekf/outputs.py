@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import time
-from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -15,19 +14,16 @@ import numpy as np
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.common.lazy import rotations
+from uwb_tdoa_bias.common.transforms import Frames
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS, TF_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
+from uwb_tdoa_bias.ros.node import StreamNode
 from uwb_tdoa_bias.ros.topics import Epoch, StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
+from .monitoring.status import Status
 from .results import Odometry, Residuals, pose_and_twist
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.transforms import Frames
-    from uwb_tdoa_bias.ros.node import StreamNode
-
-    from .monitoring.status import Status
 
 STATUS_PERIOD = 0.95  # s; the node checks five times a second
 ODOMETRY = "pose", "twist"

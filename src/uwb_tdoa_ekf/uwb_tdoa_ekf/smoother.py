@@ -15,13 +15,15 @@ all that the filter used: IMU, process noise, and every other measurement.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize
+from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.flight import Flight, Truth
@@ -37,15 +39,6 @@ from .core.state import ERROR_STATES, MOVING_STATES, inject
 from .core.update import SMALLEST
 from .offline import Run, may_have_offset, run_offline, without_offset, without_unknown_offset
 from .results import OF_ROW, Odometry
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-
-    from numpy.typing import ArrayLike
-    from scipy.sparse import csr_array
-
-    from uwb_tdoa_bias.common.flight import Flight
-
 
 RANGE = "range"
 LAGS = 64  # most ranges of one anchor over which their errors are compared

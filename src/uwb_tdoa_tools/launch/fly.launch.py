@@ -9,24 +9,20 @@ ros2 launch uwb_tdoa_tools fly.launch.py --show-args
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 import os
-from typing import TYPE_CHECKING
 
 from launch import LaunchDescription
+from launch.action import Action
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.events.process import ProcessExited
+from launch.launch_context import LaunchContext
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, Start, discovery, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
 from uwb_tdoa_tools.flying.rover import FILTER
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    from launch.action import Action
-    from launch.events.process import ProcessExited
-    from launch.launch_context import LaunchContext
 
 VALUES = {  # parameters of vehicle_node; one that is not given is its default
     "vehicle": "quadrotor, or rover, which drives, with mission alone",

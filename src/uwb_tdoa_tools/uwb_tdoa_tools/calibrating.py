@@ -150,8 +150,8 @@ def usable_paths(
             line = command_lines.survey_line(path, survey, effects)
             result = check(recording, (), estimator, line)
             cli.show(report.text(result))
-            for remark in estimator.remarks(recording.anchors):
-                cli.say("calibrate", f"{recording.name}: {remark}")
+            remarks = estimator.remarks(recording.anchors)
+            cli.say("calibrate", *(f"{recording.name}: {remark}" for remark in remarks))
             errors = blocking_errors(recording, result.findings, std)
             if errors:
                 named = "; ".join(f"{finding.cause} ({finding.rule})" for finding in errors)
@@ -167,8 +167,7 @@ def usable_paths(
     for finding in different_surveys(list(usable.values())):
         raise InputError(f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
     surveys = [survey for path, survey in (*found, *held) if path in usable]
-    for remark in report.remark_on_surveys(surveys, list(usable.values())):
-        cli.say("calibrate", remark)
+    cli.say("calibrate", *report.remark_on_surveys(surveys, list(usable.values())))
     paths, judges = ([path for path, _ in some if path in usable] for some in recordings)
     if held and paths and not judges:
         cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")

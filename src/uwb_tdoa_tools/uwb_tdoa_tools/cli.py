@@ -188,9 +188,10 @@ def write_json(path: str | Path, content: dict[str, Any]) -> None:
     write_text(path, text + "\n")
 
 
-def say(name: str, sentence: object) -> None:
-    """Print `name: sentence` on stderr, as a `line_of` text."""
-    print(f"{name}: {line_of(sentence)}", file=sys.stderr, flush=True)
+def say(name: str, *sentences: object) -> None:
+    """Print `name: sentence` on stderr for each sentence, as a `line_of` text."""
+    for sentence in sentences:
+        print(f"{name}: {line_of(sentence)}", file=sys.stderr, flush=True)
 
 
 def show(*lines: str) -> None:

@@ -117,7 +117,7 @@ class VehicleNode(StreamNode):
         )
         self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
         say_unused([self], files_of(arguments))
-        self.turns = StreamPoller([self])
+        self.turns = StreamPoller([self.take])
         self.get_logger().info(
             "ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry"
         )

@@ -165,6 +165,11 @@ class Anchors:
         )
         write_text(path, f"# {written_by()}\n{text}")
 
+    def to_csv(self, path: str | Path) -> None:
+        """Write ids and positions as a CSV file, to 0.1 mm, that `read_survey` reads."""
+        rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(self.ids, self.positions))
+        write_text(path, "\n".join(["id,x,y,z", *rows, ""]))
+
 
 def _whole(ids: ArrayLike) -> np.ndarray:
     """Return ids as (N,) int64; raise InputError unless all are whole numbers 0 ... 65535."""

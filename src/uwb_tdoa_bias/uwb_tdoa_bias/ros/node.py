@@ -17,7 +17,7 @@ import signal
 import sys
 import time
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import rclpy
@@ -164,12 +164,6 @@ PERIOD = 0.001  # s, smallest rest after a turn
 LONGEST_REST = 0.01
 
 
-class Taking(Protocol):
-    """Takes arrived messages; `take` returns whether any arrived or still wait."""
-
-    def take(self) -> bool: ...
-
-
 class StreamPoller:
     """Lets nodes take their arrived messages, one node after the other.
 
@@ -178,14 +172,14 @@ class StreamPoller:
 
     PERIOD = PERIOD
 
-    def __init__(self, streams: Collection[Taking]) -> None:
-        """Set the streams: Streams, or other objects with take()."""
-        self._streams = streams
+    def __init__(self, takes: Collection[Callable[[], bool]]) -> None:
+        """Set functions as `Streams.take`: each returns whether messages arrived, or still wait."""
+        self._takes = takes
 
     def take(self) -> float | None:
         """Run one turn, and return the rest after it, s; None if nothing arrived."""
         began = time.monotonic()
-        if not any([streams.take() for streams in self._streams]):
+        if not any([take() for take in self._takes]):
             return None
         return min(max(time.monotonic() - began, PERIOD), LONGEST_REST)
 

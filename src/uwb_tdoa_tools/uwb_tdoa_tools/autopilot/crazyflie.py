@@ -12,7 +12,7 @@ import logging
 from queue import SimpleQueue
 import re
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from geometry_msgs.msg import Vector3
 from rclpy.node import Node
@@ -27,10 +27,6 @@ from uwb_tdoa_msgs.msg import Tdoa
 from ..bags.messages import BODY_FRAME
 from ..crazyflie import BLOCKS, LogBlock, VehicleClock
 from .estimate import Estimate, Link, missing
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
 
 TOPICS = {
     "tdoa": ("uwb/tdoa", Tdoa),

@@ -81,8 +81,8 @@ def _check(args: Namespace) -> int:
     reports, recordings = [], []
     for recording, path, survey in _recordings(args, reading, alone):
         recordings.append(recording)
-        for remark in estimator.remarks(recording.anchors):
-            cli.say("check", f"{recording.name}: {remark}")
+        remarks = estimator.remarks(recording.anchors)
+        cli.say("check", *(f"{recording.name}: {remark}" for remark in remarks))
         line = command_lines.survey_line(path, survey, args.effects) if path else None
         reports.append(check(recording, others, estimator, line))
         cli.show(report.text(reports[-1]))
@@ -109,8 +109,7 @@ def _recordings(
     with Progress("check", len(found), "flight") as progress:
         for path, its_survey in found:
             recording = read_recording(reading, path, its_survey)
-            for remark in recording.remarks:
-                cli.say("check", f"{path}: {remark}")
+            cli.say("check", *(f"{path}: {remark}" for remark in recording.remarks))
             yield recording, path, its_survey
             progress.update()
 

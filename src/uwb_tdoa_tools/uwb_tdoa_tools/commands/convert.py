@@ -125,8 +125,7 @@ def _convert(args: Namespace) -> None:
         return
     cli.show(*described(made))
     cli.show(f"  -> {args.out}")
-    for sentence in made["apart"]:
-        cli.say("convert", sentence)
+    cli.say("convert", *made["apart"])
 
 
 def _suggest(args: Namespace) -> None:

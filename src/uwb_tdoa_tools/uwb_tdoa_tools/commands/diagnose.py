@@ -174,13 +174,9 @@ def _diagnose(args: Namespace) -> int:
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
         inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
-    for remark in remarks_on(
-        [*flights, *holdout],
-        [its_survey for _, its_survey in (*found, *reading.find(args.holdout))],
-    ):
-        cli.say("diagnose", remark)
-    for remark in judge.remarks(flights[0].anchors):
-        cli.say("diagnose", remark)
+    surveys = [its_survey for _, its_survey in (*found, *reading.find(args.holdout))]
+    remarks = remarks_on([*flights, *holdout], surveys)
+    cli.say("diagnose", *remarks, *judge.remarks(flights[0].anchors))
     for name in ("marks", "odometry"):
         if args.reference == name and getattr(args, name) is None:
             raise InputError(f"--reference {name}: --{name} says which, and is missing.")

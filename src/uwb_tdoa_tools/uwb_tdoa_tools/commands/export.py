@@ -111,10 +111,8 @@ def _export(args: Namespace) -> None:
         if args.c:
             write_c(args.c, traced)
         not_flown = write_crazyflie(args.crazyflie, traced, stddev) if args.crazyflie else ()
-    for omitted in (*orientation_remarks(*given), *traced.left_out):
-        say(str(omitted))
-    for omitted in not_flown:
-        say(f"{args.crazyflie}: {omitted}")
+    say(*orientation_remarks(*given), *traced.left_out)
+    say(*(f"{args.crazyflie}: {omitted}" for omitted in not_flown))
     name = traced.meta()["name"]
     for made in filter(None, (args.onnx, args.c, args.crazyflie)):
         cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {made}")

@@ -7,7 +7,6 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.files import write_text
 
 from .. import choices, cli, command_lines, options
 from ..cli import option
@@ -100,8 +99,7 @@ def _map_anchors(args: Namespace) -> int:
         return 1
     anchors = found.anchors(frame)
     anchors.to_yaml(args.out / "anchors.yaml")
-    rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
-    write_text(args.out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
+    anchors.to_csv(args.out / "anchors.csv")
     cli.show(f"wrote anchors.yaml, anchors.csv, map.json and map.png to {args.out}")
     if args.flights:
         survey = "--survey", args.out / "anchors.yaml"

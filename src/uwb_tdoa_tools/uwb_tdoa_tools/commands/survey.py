@@ -7,8 +7,6 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from functools import partial
 
-from uwb_tdoa_bias.common.files import write_text
-
 from .. import cli, command_lines, options, parallel
 from ..parallel import Progress
 
@@ -86,10 +84,8 @@ def _survey(args: Namespace) -> int:
     jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)))
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
     flights = reading.flights(args.flights, None, jobs, dask)
-    for remark in remark_on_surveys([its for _, its in reading.find(args.flights)], flights):
-        cli.say("survey", remark)
-    for remark in judge.remarks(flights[0].anchors):
-        cli.say("survey", remark)
+    remarks = remark_on_surveys([its for _, its in reading.find(args.flights)], flights)
+    cli.say("survey", *remarks, *judge.remarks(flights[0].anchors))
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(
@@ -101,8 +97,7 @@ def _survey(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")
-    rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
-    write_text(out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
+    anchors.to_csv(out / "anchors.csv")
     result.effects.to_yaml(out / "effects.yaml")
     config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config, has_imu(flights))
     cli.write_json(out / "survey.json", as_dict(result))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.typesys.store import Typestore
+from scipy.ndimage import binary_erosion
 
 from uwb_tdoa_bias.common.anchors import Anchors
 
@@ -324,7 +325,9 @@ def _occupancy(store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: 
 
 def _markers(store: Typestore, chart: Chart, anchors: Anchors) -> Any:
     types, grid = store.types, chart.grid
-    surface = _surface(chart.flyable.reshape(grid.shape)).ravel()
+    flyable = chart.flyable.reshape(grid.shape)
+    # cells beside one that cannot be flown, or at the edge of the grid
+    surface = (flyable & ~binary_erosion(flyable)).ravel()
     error = chart.error[surface]
     worse = (error - error.min(initial=np.inf)) / max(np.ptp(error) if len(error) else 0.0, 1e-9)
     green_to_red = np.column_stack(
@@ -375,13 +378,3 @@ def _marker(
         "mesh_use_embedded_materials": False,
     }
     return types["visualization_msgs/msg/Marker"](**{**usual, **fields})
-
-
-def _surface(cells: np.ndarray) -> np.ndarray:
-    """Return the cells that are true and have a false neighbour, or the edge of the grid."""
-    padded = np.pad(cells, 1)
-    inner = np.ones_like(cells)
-    for axis in range(3):
-        for shift in (-1, 1):
-            inner &= np.roll(padded, shift, axis)[1:-1, 1:-1, 1:-1]
-    return cells & ~inner

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
@@ -219,35 +219,30 @@ class Distribution:
         raise AssertionError("the bins hold fewer than were counted")
 
 
-class PooledErrors:
-    """The figures of one phase, pooled over runs."""
+def pooled_errors(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the figures of one phase of all samples, and median and maximum over the runs.
 
-    def __init__(self) -> None:
-        self._columns: dict[str, list[float]] = defaultdict(list)  # of the runs
-
-    def add(self, figures: dict[str, Any]) -> None:
-        """Count the figures of one run, see `ErrorSeries.figures`."""
-        for name in (*WHOLE, *ROOTS, "nees_mean", "max_3d", "step"):
-            self._columns[name].append(figures[name])
-
-    def figures(self) -> dict[str, Any]:
-        """Return the figures of all samples, and median and maximum over the runs, as a dict."""
-        of_runs = {name: np.array(values) for name, values in self._columns.items()}
-        count = of_runs["count"]
-        total = count.sum()
-        out: dict[str, Any] = {"runs": len(count)}
-        out |= {name: of_runs[name].sum().item() for name in WHOLE}
-        some = {name: values[count > 0] for name, values in of_runs.items()}
-        shares = some["count"] / max(total, 1)
-        for name in ROOTS:
-            out[name] = math.sqrt(shares @ some[name] ** 2) if total else math.nan
-        out["nees_mean"] = float(shares @ some["nees_mean"]) if total else math.nan
-        for name in ("max_3d", "step"):
-            out[name] = or_nan(np.max, some[name])
-        for name in ("rmse_3d", "nees_mean"):
-            out[f"{name}_median_of_runs"] = or_nan(np.median, some[name])
-            out[f"{name}_max_of_runs"] = or_nan(np.max, some[name])
-        return out
+    runs : figures of each run, see `ErrorSeries.figures`.
+    """
+    of_runs = {
+        name: np.array([figures[name] for figures in runs])
+        for name in (*WHOLE, *ROOTS, "nees_mean", "max_3d", "step")
+    }
+    count = of_runs["count"]
+    total = count.sum()
+    out: dict[str, Any] = {"runs": len(count)}
+    out |= {name: of_runs[name].sum().item() for name in WHOLE}
+    some = {name: values[count > 0] for name, values in of_runs.items()}
+    shares = some["count"] / max(total, 1)
+    for name in ROOTS:
+        out[name] = math.sqrt(shares @ some[name] ** 2) if total else math.nan
+    out["nees_mean"] = float(shares @ some["nees_mean"]) if total else math.nan
+    for name in ("max_3d", "step"):
+        out[name] = or_nan(np.max, some[name])
+    for name in ("rmse_3d", "nees_mean"):
+        out[f"{name}_median_of_runs"] = or_nan(np.median, some[name])
+        out[f"{name}_max_of_runs"] = or_nan(np.max, some[name])
+    return out
 
 
 @dataclass(frozen=True)
@@ -281,7 +276,7 @@ class Pool:
         self._rows: dict[str, list[float]] = defaultdict(list)  # figures of the runs
         self._sums: dict[str, Any] = Counter()  # numbers, some of them float
         self._distributions = {name: Distribution.of([]) for name in ("distance", "nees", "nis")}
-        self._phases: dict[str, PooledErrors] = defaultdict(PooledErrors)
+        self._phases: dict[str, list[dict[str, Any]]] = defaultdict(list)  # figures of the runs
         self._aligned: dict[str, Any] = Counter()
         self.attitudes: dict[str, tuple[float, ...]] = {}  # {flight: ATTITUDE} where it is known
 
@@ -296,7 +291,7 @@ class Pool:
         for name, part in result.distributions.items():
             self._distributions[name] += part
         for name, figures in result.phases.items():
-            self._phases[name].add(figures)
+            self._phases[name].append(figures)
         for how in ALIGN if result.aligned else ():
             error = result.aligned[f"rmse_3d_{how}"]
             self._aligned[how] += math.nan if error is None else error
@@ -307,8 +302,8 @@ class Pool:
         return {how: total / len(self._rows["rmse_3d"]) for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
-        """Return {name: figures, see `PooledErrors.figures`} of the phases that any run has."""
-        return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
+        """Return {name: figures, see `pooled_errors`} of the phases that any run has."""
+        return {name: pooled_errors(self._phases[name]) for name in TITLES if name in self._phases}
 
     def figures(self) -> dict[str, Any]:
         """Return the figures of at least one run as a dict.

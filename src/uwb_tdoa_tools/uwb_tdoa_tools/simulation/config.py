@@ -619,27 +619,34 @@ class SimulationConfig(_Noises):
                 np.shape(value) == (length,) and np.isfinite(value).all()
             ):
                 raise InputError(f"{name}: {value!r} is not {length} finite numbers of metres.")
-        if self.path is not None and not (
-            _are_points(self.path, (2, 3)) and len({*self.path}) >= 2
-        ):
-            raise InputError(
+        for wrong, said in (
+            (
+                self.path is not None
+                and not (_are_points(self.path, (2, 3)) and len({*self.path}) >= 2),
                 f"path: {self.path!r} is not two different points or more, each x, y or x, y, "
-                "z in metres."
-            )
-        if self.poses is not None and not (
-            _are_points(self.poses, (5,))
-            and len(self.poses) >= 2
-            and (np.diff([pose[0] for pose in self.poses]) > 0.0).all()
+                "z in metres.",
+            ),
+            (
+                self.poses is not None
+                and not (
+                    _are_points(self.poses, (5,))
+                    and len(self.poses) >= 2
+                    and (np.diff([pose[0] for pose in self.poses]) > 0.0).all()
+                ),
+                "poses: expected two or more rows t, x, y, z, yaw (s, m, rad) with rising t.",
+            ),
+            (
+                self.area is not None
+                and not (
+                    _are_points(self.area, (2,))
+                    and len(self.area) == 2
+                    and all(low < high for low, high in zip(*self.area))
+                ),
+                f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres.",
+            ),
         ):
-            raise InputError(
-                "poses: expected two or more rows t, x, y, z, yaw (s, m, rad) with rising t."
-            )
-        if self.area is not None:
-            good = _are_points(self.area, (2,)) and len(self.area) == 2
-            if not good or not all(low < high for low, high in zip(*self.area)):
-                raise InputError(
-                    f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres."
-                )
+            if wrong:
+                raise InputError(said)
 
     def complete(self) -> tuple[Complete, Room]:
         """Return (config, Room); place, height, radius, anchors and anchor_noise_std are filled in."""

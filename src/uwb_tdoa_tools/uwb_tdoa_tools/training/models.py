@@ -10,7 +10,7 @@ for five epochs in a row. The standard deviation is that on the validation fligh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,7 +43,7 @@ from ..diagnosis.validation import select_by_error
 from ..exporting.onnx_file import GraphBuilder
 from ..parallel import MapFunction
 from ..scoring.evaluation import evaluate
-from ..scoring.metrics import SHARES, Errors, Shrinkage, best_share
+from ..scoring.metrics import SHARES, Errors, Shrinkage, best_share, rms
 from . import labels as labelling
 from .labels import Labels, by_constellation, labels, with_level_attitude
 
@@ -425,7 +425,7 @@ def train(
     else:
         model, curve, left = _paper(seed, first, second, progress)
         meta |= _limits(model, first, second)
-    errors = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(second, left)}
+    errors = {one.name: (rms(one.error), rms(after)) for one, after in zip(second, left)}
     return Trained(model, effects, curve, meta, errors)
 
 
@@ -446,7 +446,7 @@ def _paper(
     if len(model.names) < len(FEATURES):
         progress("an anchor has no orientation: the network does without all of them")
     left = [one.error - model.mean(one.samples) for one in validation]
-    variance = _rms(left) ** 2 - labelling.white_noise(validation) ** 2
+    variance = rms(np.concatenate(left)) ** 2 - labelling.white_noise(validation) ** 2
     model.std = float(np.sqrt(max(variance, SMALLEST_STD**2)))
     return model, ("epochs", list(range(1, len(errors[0]) + 1)), *errors), left
 
@@ -462,7 +462,7 @@ def _limits(
             validity[name] = [round(float(low), 3), round(float(high), 3), MARGINS[name[0]]]
     limits: dict[str, Any] = {
         "validity": validity,
-        "fade_std": _rms(one.error for one in validation),
+        "fade_std": rms(np.concatenate([one.error for one in validation])),
     }
     heads = [validity[name] for name in ("forward_x", "forward_y")]
     if any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
@@ -487,13 +487,9 @@ def _evaluate_effects(
             [one.error - effects.bias(one.samples) for one in group]
             for group in ([training[k] for k in some], validation)
         )
-        curve[0].append(_rms(of_fit))
-        curve[1].append(_rms(left))
+        curve[0].append(rms(np.concatenate(of_fit)))
+        curve[1].append(rms(np.concatenate(left)))
     return ("training flights", counts, *curve), left
-
-
-def _rms(parts: Iterable[np.ndarray]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate([*parts]) ** 2)))
 
 
 def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
