@@ -28,9 +28,7 @@ from .ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
-    files_of,
     refuse_unknown,
-    say_unused,
 )
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
@@ -50,8 +48,8 @@ class AnchorsNode(StreamNode):
 
     NAME = "anchors_node"
 
-    def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """Publish the anchors; arguments : of the process."""
+    def __init__(self) -> None:
+        """Publish the anchors."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -67,7 +65,6 @@ class AnchorsNode(StreamNode):
             ("uwb/anchors/markers", ANCHORS_QOS, markers(message, own["marker_size"])),
         ):
             self.create_publisher(type(content), topic, qos).publish(content)
-        say_unused([self], files_of(arguments))
         self.get_logger().info(
             f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'"
         )

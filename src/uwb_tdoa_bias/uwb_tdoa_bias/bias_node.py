@@ -47,9 +47,7 @@ from .ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
-    files_of,
     refuse_unknown,
-    say_unused,
 )
 from .ros.topics import Epoch, StreamOutput, Streams, several_publishers
 
@@ -139,14 +137,11 @@ class BiasNode(StreamNode):
 
     NAME = "bias_node"
 
-    def __init__(
-        self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any
-    ) -> None:
+    def __init__(self, member: Collection[str] | None = None, **options: Any) -> None:
         """Start the node.
 
         Parameters
         ----------
-        arguments : of the process
         member : None for a separate node. In a localization_node: names of parameters of its other nodes;
             it calls the turns of this node and hands over the odometry.
         options : of Node
@@ -181,7 +176,6 @@ class BiasNode(StreamNode):
         self._diagnostics = Diagnostics(self, self._report)
         self._anchors.start()
         if member is None:
-            say_unused([self], files_of(arguments))
             self.turns = StreamPoller([self.streams.take])
         self.ready = f"ready; correcting with: {self._model_name}"
 

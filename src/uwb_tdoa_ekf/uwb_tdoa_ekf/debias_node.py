@@ -28,9 +28,7 @@ from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
-    files_of,
     refuse_unknown,
-    say_unused,
 )
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 
@@ -53,14 +51,8 @@ class DebiasNode(StreamNode):
 
     NAME = "debias_node"
 
-    def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """Load the map, subscribe to odometry and anchors, and advertise the corrected odometry.
-
-        Parameters
-        ----------
-        arguments : sequence of str
-            Command line arguments of the process.
-        """
+    def __init__(self) -> None:
+        """Load the map, subscribe to odometry and anchors, and advertise the corrected odometry."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -83,7 +75,6 @@ class DebiasNode(StreamNode):
         self._map_fits_anchors: bool | None = None
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self._anchors.start()
-        say_unused([self], files_of(arguments))
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; {len(self._map.at)} markers"
 

@@ -39,7 +39,7 @@ from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros.anchors import AnchorsInput, FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
 from uwb_tdoa_bias.ros.node import Diagnostics, Elapsed, Report, StreamNode, StreamPoller, run
-from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.ros.parameters import refuse_unknown
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
@@ -101,15 +101,11 @@ class EkfNode(StreamNode):
 
     NAME = "ekf_node"
 
-    def __init__(
-        self, arguments: Sequence[str] = (), member: set[str] | None = None, **options: Any
-    ) -> None:
+    def __init__(self, member: set[str] | None = None, **options: Any) -> None:
         """Declare parameters, compile the filter, and connect all topics.
 
         Parameters
         ----------
-        arguments : sequence of str
-            Command line arguments of the process.
         member : set of str or None
             Given by a localization_node: names of parameters that may belong to its other nodes.
             The node then takes turns from its owner and receives corrected TDOAs in memory.
@@ -191,7 +187,6 @@ class EkfNode(StreamNode):
         self._diagnostics = Diagnostics(self, self._report, self._tell_status)
         self._anchors.start()
         if member is None:
-            say_unused([self], files_of(arguments))
             self.turns = StreamPoller([self.streams.take])
         self.ready = "ready"
 

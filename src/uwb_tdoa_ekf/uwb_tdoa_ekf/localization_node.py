@@ -33,8 +33,6 @@ from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
-    files_of,
-    say_unused,
 )
 from uwb_tdoa_bias.ros.topics import InMemoryReceiver
 
@@ -59,13 +57,13 @@ class LocalizationNode(StreamNode):
 
     NAME = "localization_node"
 
-    def __init__(self, arguments: Sequence[str] = ()) -> None:
+    def __init__(self, arguments: Sequence[str] | None) -> None:
         """Start the nodes of each tag.
 
         Parameters
         ----------
-        arguments : sequence of str
-            Command line arguments of the process.
+        arguments : sequence of str or None
+            Command line arguments of the process; default: sys.argv[1:].
         """
         super().__init__(self.NAME)
         tags = declare_all(self, PARAMETERS)["tags"]
@@ -74,14 +72,14 @@ class LocalizationNode(StreamNode):
                 f"tags: {list(tags)!r} must be a list of different namespaces, e.g. ['tag1', "
                 "'tag2']."
             )
-        self._tags = [Tag(self, tag, partial(self._start, tag, list(arguments))) for tag in tags]
+        given = sys.argv[1:] if arguments is None else [*arguments]
+        self._tags = [Tag(self, tag, partial(self._start, tag, given)) for tag in tags]
         for tag in self._tags:
             tag.begin()
         refused = [tag.refused for tag in self._tags if tag.refused is not None]
         if len(refused) == len(self._tags):
             raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
-        say_unused([self, *self.members], files_of(arguments))
         self.turns = StreamPoller([each.take for each in self._tags])
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
@@ -101,7 +99,7 @@ class LocalizationNode(StreamNode):
         They get the arguments of the process without the remappings of this node. Their `body_frame`
         is TAG/base_link, unless the arguments say otherwise. After an exception no node is left.
 
-        tag : relative namespace, "" for that of this node; arguments : those of `__init__`
+        tag : relative namespace, "" for that of this node; arguments : of the process
         """
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         frame = ["-p", f"body_frame:={tag}/base_link"] if tag else []
@@ -273,7 +271,7 @@ def _without_own_remappings(arguments: list[str]) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node and return the exit code."""
-    return run(LocalizationNode, __doc__, argv)
+    return run(LocalizationNode, __doc__, argv, arguments=argv)
 
 
 if __name__ == "__main__":

@@ -28,9 +28,7 @@ from uwb_tdoa_bias.ros.node import Diagnostics, Rate, StreamNode, run
 from uwb_tdoa_bias.ros.parameters import (
     Parameter,
     declare_all,
-    files_of,
     refuse_unknown,
-    say_unused,
 )
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 from uwb_tdoa_msgs.msg import EstimatorStatus
@@ -101,14 +99,8 @@ class AutopilotNode(StreamNode):
     NAME = "autopilot_node"
     PERIOD = REST  # see `take`
 
-    def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """Open the link, subscribe to odometry and status.
-
-        Parameters
-        ----------
-        arguments : sequence of str
-            Command line arguments of the process.
-        """
+    def __init__(self) -> None:
+        """Open the link, subscribe to odometry and status."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -132,7 +124,6 @@ class AutopilotNode(StreamNode):
         )
         self._status = Input(self, EstimatorStatus, "status", self._on_status, STATUS_QOS)
         self._diagnostics = Diagnostics(self, self._report)
-        say_unused([self], files_of(arguments))
         self.turns = self
         self.ready = f"ready; protocol {own['protocol']}"
 

@@ -30,9 +30,7 @@ from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import (
     Parameter,
     declare_all,
-    files_of,
     refuse_unknown,
-    say_unused,
 )
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
@@ -82,8 +80,8 @@ class VehicleNode(StreamNode):
 
     NAME = "vehicle_node"
 
-    def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """Declare the parameters, and wait for listeners. arguments : of the process."""
+    def __init__(self) -> None:
+        """Declare the parameters, and wait for listeners."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -116,7 +114,6 @@ class VehicleNode(StreamNode):
             ]
         )
         self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
-        say_unused([self], files_of(arguments))
         self.turns = StreamPoller([self.take])
         self.get_logger().info(
             "ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry"

@@ -38,7 +38,7 @@ from rosgraph_msgs.msg import Clock
 from ..common.errors import InputError, line_of
 from ..common.executable import interrupt
 from .cdr import Message, decode
-from .parameters import ParameterNode
+from .parameters import ParameterNode, files_of, say_unused
 from .topics import unserved, waiting
 
 Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
@@ -288,7 +288,10 @@ def _nothing() -> None:
 
 
 def run(
-    node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None
+    node_class: type[StreamNode],
+    description: str | None,
+    argv: Sequence[str] | None = None,
+    **given: Any,
 ) -> int:
     """Run a node until SIGINT or SIGTERM, and return the exit code.
 
@@ -297,8 +300,8 @@ def run(
 
     Parameters
     ----------
-    node_class : callable of the arguments of the process -> StreamNode, in an initialised rclpy. It has
-        the executable's NAME, and may have `members` and `turns`, a StreamPoller.
+    node_class : callable of `given` -> StreamNode, in an initialised rclpy. It has the executable's
+        NAME, and may have `members` and `turns`, a StreamPoller.
     description : for --help
     argv : arguments, default: sys.argv[1:]
     """
@@ -323,8 +326,9 @@ def run(
     spinner: Spinner | None = None
     try:
         _init(parser, arguments)
-        node = node_class(arguments)
+        node = node_class(**given)
         nodes = [node, *node.members]
+        say_unused(nodes, files_of(arguments))
         spinner = Spinner(nodes, getattr(node, "turns", None))
         gc.collect()
         gc.freeze()  # numba's objects are never garbage; searching them takes 0.1 s

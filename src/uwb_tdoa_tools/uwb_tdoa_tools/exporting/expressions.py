@@ -22,9 +22,12 @@ pair      `value` is the bytes of (N, N) float32: the number of the pair
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "neg": np.negative,
@@ -54,38 +57,17 @@ COMPARISONS, LOGICAL = ("lt", "le", "eq"), ("not", "and", "or")
 NEUTRAL = {"add": 0.0, "mul": 1.0, "and": True, "or": False}
 EVEN = 1e-5  # share by which the widths of pieces of one width may differ, rounded
 SAME = 1e-9  # m; a smaller difference of constants is rounding
+LN_10 = math.log(10.0)
 ANGLE = 3.1416  # rad, no atan2 is larger in single precision
 
 
-def _operators(kind: str) -> tuple[Any, Any]:
-    """Return methods of Expression for an operator, and for the same with swapped operands."""
+class Expression(NDArrayOperatorsMixin):
+    """A number of each TDOA, as the module describes.
 
-    def method(self: Expression, other: Any) -> Any:
-        if isinstance(other, np.ndarray):  # element by element
-            return np.frompyfunc(lambda one: apply(kind, self, one), 1, 1)(other)
-        return apply(kind, self, other)
-
-    def swapped(self: Expression, other: Any) -> Any:
-        if isinstance(other, np.ndarray):
-            return np.frompyfunc(lambda one: apply(kind, one, self), 1, 1)(other)
-        return apply(kind, other, self)
-
-    return method, swapped
-
-
-class Expression:
-    """A number of each TDOA, as the module describes. The operators of Python record others."""
+    Operators of Python and functions of numpy record others, element by element of an array.
+    """
 
     __slots__ = ("inputs", "kind", "value")
-    __array_ufunc__ = None  # numpy leaves operators to this class
-    __hash__ = None  # type: ignore[assignment]  # == is recorded
-    __add__, __radd__ = _operators("add")
-    __sub__, __rsub__ = _operators("sub")
-    __mul__, __rmul__ = _operators("mul")
-    __truediv__, __rtruediv__ = _operators("div")
-    __lt__, __gt__ = _operators("lt")
-    __le__, __ge__ = _operators("le")
-    __eq__, _ = _operators("eq")
 
     def __init__(self, kind: str, inputs: tuple[Expression, ...] = (), value: Any = None) -> None:
         """Set all attributes."""
@@ -98,30 +80,13 @@ class Expression:
             return bool(self.value.dtype == bool)
         return self.kind in (*COMPARISONS, *LOGICAL)
 
-    def __ne__(self, other: Any) -> Any:
-        return apply("not", self == other)
-
     def __bool__(self) -> bool:
         return _WAYS[-1].choose(self)
 
-    def __neg__(self) -> Expression:
-        return apply("neg", self)
-
-    def __abs__(self) -> Expression:
-        return apply("abs", self)
-
-    def __pow__(self, exponent: float) -> Expression:
-        """Return a positive whole power by repeated squares."""
-        if exponent != round(exponent) or exponent < 1:
-            raise TypeError(
-                f"an effect may not take the power {exponent!r}, only positive integers; write the "
-                "equation with numpy.sqrt"
-            )
-        if exponent == 1:
-            return self
-        half = self ** (exponent // 2)
-        square = apply("mul", half, half)
-        return apply("mul", square, self) if exponent % 2 else square
+    # more : the output of +=, whose place the caller gives to the result
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **more: Any) -> Any:
+        arrays = (np.asarray(one, dtype=object) for one in inputs)
+        return np.frompyfunc(FUNCTIONS[ufunc], len(inputs), 1)(*arrays)
 
 
 def constant(values: Any) -> Expression:
@@ -190,6 +155,42 @@ def _bounds(one: Expression) -> tuple[float, float]:
     if one.kind == "where":
         return min(known[1][0], known[2][0]), max(known[1][1], known[2][1])
     return -np.inf, np.inf
+
+
+def _power(base: Any, exponent: Any) -> Expression:
+    """Return a positive whole power by repeated squares, or a number to the power of a symbol."""
+    if isinstance(exponent, Expression):
+        return apply("exp", exponent * math.log(base))
+    if exponent != round(exponent) or exponent < 1:
+        raise TypeError(
+            f"an effect may not take the power {exponent!r}, only positive integers; write the "
+            "equation with numpy.sqrt"
+        )
+    if exponent == 1:
+        return expressed(base)
+    half = _power(base, exponent // 2)
+    square = apply("mul", half, half)
+    return apply("mul", square, base) if exponent % 2 else square
+
+
+FUNCTIONS: dict[Any, Callable[..., Any]] = {  # of numpy, for numbers and Expressions
+    **{function: partial(apply, kind) for kind, function in ELEMENTWISE.items()},
+    np.not_equal: lambda x, y: apply("not", apply("eq", x, y)),
+    np.invert: partial(apply, "not"),
+    np.bitwise_and: partial(apply, "and"),
+    np.bitwise_or: partial(apply, "or"),
+    np.greater: lambda x, y: apply("lt", y, x),
+    np.greater_equal: lambda x, y: apply("le", y, x),
+    np.isnan: lambda x: apply("not", apply("eq", x, x)),
+    np.isfinite: lambda x: apply("eq", x - x, 0.0),
+    np.square: lambda x: x * x,
+    np.power: _power,
+    np.hypot: lambda x, y: apply("sqrt", x * x + y * y),
+    np.copysign: lambda size, sign: apply("where", apply("lt", sign, 0.0), -abs(size), abs(size)),
+    np.log10: lambda x: apply("log", x) * (1.0 / LN_10),
+    np.remainder: remainder,
+    np.arcsin: lambda x: apply("atan2", x, apply("sqrt", (1.0 - x) * (1.0 + x))),
+}
 
 
 class _Way:

@@ -34,18 +34,16 @@ from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_bias.effects.samples import Motion
 
 from .expressions import (
-    ELEMENTWISE,
+    FUNCTIONS,
     Expression,
     Pieces,
     apply,
     constant,
     expressed,
     merged,
-    remainder,
 )
 
 MOST_ANCHORS = 128  # constants of pairs grow with the square
-LN_10 = math.log(10.0)
 
 
 def samples_of(anchors: Anchors, motion: bool) -> Samples:
@@ -103,6 +101,12 @@ class TracedSamples(Samples):
         return len(self.p)
 
 
+def _constants(values: np.ndarray) -> np.ndarray:
+    """Return an array of constants, each of the numbers along the last axis."""
+    each = map(constant, values.reshape(-1, values.shape[-1]))
+    return np.array([*each], dtype=object).reshape(values.shape[:-1])
+
+
 class Traced(NDArrayOperatorsMixin, SymbolicArray):
     """An array of symbols, for numpy of shape (blocks * n, ...).
 
@@ -144,10 +148,7 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         blocks = np.moveaxis(
             values.reshape(len(values) // self.n, self.n, *values.shape[1:]), 1, -1
         )
-        out = np.empty(blocks.shape[:-1], dtype=object)
-        for place in np.ndindex(*out.shape):
-            out[place] = constant(blocks[place][: self.pairs])
-        return out
+        return _constants(blocks[..., : self.pairs])
 
     def is_by_row(self, values: np.ndarray) -> bool:
         """Return whether an array of numbers has a row for each of the samples."""
@@ -168,7 +169,7 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
         if ufunc is np.matmul:
             values, weights = inputs
             return np.sum(values * weights, axis=-1)
-        return self.each(_FUNCTIONS[ufunc], *inputs)
+        return self.each(FUNCTIONS[ufunc], *inputs)
 
     def each(self, function: Callable[..., Any], *inputs: Any) -> Traced:
         """Return a function of numbers for all elements of some operands."""
@@ -189,19 +190,12 @@ class Traced(NDArrayOperatorsMixin, SymbolicArray):
             indexed = [one for one in key[1:] if one is not None]  # None adds an axis
             key = (slice(None),) * (self.ndim - len(indexed)) + key[1:]
         first, *others = key
-        blocks = self._blocks(first) if isinstance(first, slice) else None
-        if blocks is None:
+        begin, end, step = first.indices(len(self)) if isinstance(first, slice) else (0, 1, 1)
+        if begin % self.n or end % self.n or step != 1:
             raise TypeError(
                 f"an effect may not select single rows ({first!r}); write the equation for all rows"
             )
-        return self.of(self.elements[(blocks, *others)])
-
-    def _blocks(self, rows: slice) -> slice | None:
-        """Return the slice of the blocks that rows consist of; None if these are not whole blocks."""
-        start, stop, step = rows.indices(len(self))
-        if start % self.n or stop % self.n or step != 1:
-            return None
-        return slice(start // self.n, stop // self.n)
+        return self.of(self.elements[(slice(begin // self.n, end // self.n), *others)])
 
     @property
     def T(self) -> list[Traced]:  # noqa: N802  # as of numpy
@@ -300,46 +294,6 @@ class Blocks(list[Traced]):
         return np.sqrt(Blocks((one - middle) ** 2 for one in self).mean(0))
 
 
-# Functions of numbers
-
-
-def _power(base: Any, exponent: Any) -> Expression:
-    """Return a positive whole power of a symbol, or a number to the power of a symbol."""
-    if isinstance(exponent, Expression):
-        return apply("exp", exponent * math.log(base))
-    return expressed(base) ** exponent
-
-
-def _hypot(x: Any, y: Any) -> Expression:
-    return apply("sqrt", x * x + y * y)
-
-
-def _is_finite(x: Any) -> Expression:
-    return apply("eq", x - x, 0.0)
-
-
-def _copysign(size: Any, sign: Any) -> Expression:
-    return apply("where", apply("lt", sign, 0.0), -abs(size), abs(size))
-
-
-_FUNCTIONS: dict[Any, Callable[..., Any]] = {
-    **{function: partial(apply, kind) for kind, function in ELEMENTWISE.items()},
-    np.invert: partial(apply, "not"),
-    np.bitwise_and: partial(apply, "and"),
-    np.bitwise_or: partial(apply, "or"),
-    np.greater: lambda x, y: apply("lt", y, x),
-    np.greater_equal: lambda x, y: apply("le", y, x),
-    np.isnan: lambda x: apply("not", apply("eq", x, x)),
-    np.isfinite: _is_finite,
-    np.square: lambda x: x * x,
-    np.power: _power,
-    np.hypot: _hypot,
-    np.log10: lambda x: apply("log", x) * (1.0 / LN_10),
-    np.remainder: remainder,
-    np.arcsin: lambda x: apply("atan2", x, apply("sqrt", (1.0 - x) * (1.0 + x))),
-}
-
-
 # Functions of arrays
 
 
@@ -365,7 +319,7 @@ _ARRAYS: dict[Any, Callable[..., Any]] = {
     np.concatenate: _concatenate,
     np.hstack: partial(_concatenate, axis=1),
     np.stack: _stack,
-    np.where: lambda like, *inputs: like.each(_FUNCTIONS[np.where], *inputs),
+    np.where: lambda like, *inputs: like.each(FUNCTIONS[np.where], *inputs),
     np.sum: _sum,
     np.linalg.norm: lambda like, values, axis: np.sqrt(np.sum(values * values, axis=axis)),
     np.clip: lambda like, values, low, high: np.minimum(np.maximum(values, low), high),
@@ -394,23 +348,20 @@ class _Table:
         if not isinstance(first, Expression):
             return self._values[key]
         found = self._values[(first.value.astype(int), *others)]  # (pairs, ...)
-        out = np.empty(found.shape[1:], dtype=object)
-        for place in np.ndindex(*out.shape):
-            out[place] = constant(found[(slice(None), *place)])
-        return out[()]
+        return _constants(np.moveaxis(found, 0, -1))[()]
 
 
 _MATH = SimpleNamespace(
-    sqrt=partial(apply, "sqrt"),
-    hypot=_hypot,
-    atan2=partial(apply, "atan2"),
-    isfinite=_is_finite,
-    copysign=_copysign,
+    sqrt=np.sqrt,
+    hypot=np.hypot,
+    atan2=np.arctan2,
+    isfinite=np.isfinite,
+    copysign=np.copysign,
 )
 _NUMPY = SimpleNamespace(
     empty=lambda shape: np.empty(shape, dtype=object),
-    maximum=partial(apply, "max"),
-    minimum=partial(apply, "min"),
+    maximum=np.maximum,
+    minimum=np.minimum,
     inf=np.inf,
     nan=np.nan,
     ndarray=np.ndarray,
