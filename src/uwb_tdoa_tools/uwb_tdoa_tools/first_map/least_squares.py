@@ -9,8 +9,9 @@ many points.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
@@ -443,15 +444,20 @@ def minima(
         fits.sort(key=lambda fit: fit.cost)
         if fits[0].cost > best.cost - BETTER:
             break
-    return _distinct(fits), reached
+    return _distinct(fits, lambda one, other: _elsewhere(one.anchors, other.anchors)), reached
 
 
-def _distinct(fits: list[Fit]) -> list[Fit]:
-    out: list[Fit] = []
-    for fit in fits:
-        if all(np.abs(fit.anchors - other.anchors).max() > SAME_MAP for other in out):
-            out.append(fit)
+def _distinct(found: Iterable[Any], differ: Callable[[Any, Any], bool]) -> list[Any]:
+    """Return what differs from all that is returned before it."""
+    out: list[Any] = []
+    for one in found:
+        if all(differ(one, other) for other in out):
+            out.append(one)
     return out
+
+
+def _elsewhere(anchors: np.ndarray, others: np.ndarray) -> bool:
+    return bool(np.abs(anchors - others).max() > SAME_MAP)
 
 
 def _shapes(
@@ -478,11 +484,8 @@ def _shapes(
         reached = sum(_alike(one, best) for one in fits)
     fits.sort(key=lambda fit: fit.cost)
     limit = fits[0].cost * (1.0 + CLOSE[0]) + CLOSE[1]
-    out: list[Fit] = []
-    for fit in fits:
-        if fit.cost < limit and not any(_alike(fit, other) for other in out):
-            out.append(fit)
-    return out[:SHAPES], reached
+    near = (fit for fit in fits if fit.cost < limit)
+    return _distinct(near, lambda one, other: not _alike(one, other))[:SHAPES], reached
 
 
 def _alike(one: Fit, other: Fit) -> bool:
@@ -578,15 +581,13 @@ def _places(
             turns = [turn @ np.diag([1.0, 1.0, determinant]) for turn in random]
         found += [_settled(seen, anchors, turn, upright) for turn in turns]
     found.sort(key=lambda one: one[0])
-    out: list[tuple[np.ndarray, np.ndarray]] = []
-    there: list[np.ndarray] = []
-    for cost, turn, shift in found:
-        here = anchors @ turn.T + shift
-        new = all(np.abs(here - other).max() > SAME_MAP for other in there)
-        if new and cost < found[0][0] + CLOSE[1] and len(out) < PLACES:
-            out.append((turn, shift))
-            there.append(here)
-    return out
+    near = ((turn, shift) for cost, turn, shift in found if cost < found[0][0] + CLOSE[1])
+
+    def differ(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> bool:
+        here, there = (anchors @ turn.T + shift for turn, shift in (one, other))
+        return _elsewhere(here, there)
+
+    return _distinct(near, differ)[:PLACES]
 
 
 def _slow(accel: np.ndarray) -> np.ndarray:
