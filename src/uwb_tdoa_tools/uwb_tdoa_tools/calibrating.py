@@ -28,6 +28,7 @@ from .checking.recording import Recording, read_recording
 from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
 from .diagnosis.comparison import Baseline, compare
+from .diagnosis.noise import write_parameters
 from .diagnosis.references import GroundTruth, Nothing
 from .diagnosis.report.verdict import percent, worse_phases
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
@@ -103,6 +104,21 @@ class Calibration:
             f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm"
             f"{change and f' ({change})'} on {self.judged_on}"
         )
+
+    def save(
+        self, folder: Path, config: FilterConfig, has_imu: bool
+    ) -> tuple[Path | None, Path | None, Path | None]:
+        """Write anchors.yaml, effects.yaml and ekf_node.yaml; return their paths, or None.
+
+        There is no ekf_node.yaml if all parameters have their defaults; an earlier one is removed.
+
+        config : FilterConfig of the calibration; has_imu : whether a recording has inertial samples
+        """
+        anchors, effects = folder / "anchors.yaml", folder / "effects.yaml"
+        self.anchors.to_yaml(anchors)
+        self.effects.to_yaml(effects)
+        parameters = write_parameters(folder / "ekf_node.yaml", self.tdoa_std, config, has_imu)
+        return anchors, effects, parameters
 
 
 def blocking_errors(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:

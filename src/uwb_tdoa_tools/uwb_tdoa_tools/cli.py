@@ -181,8 +181,13 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
     return own
 
 
-def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Write a dict as JSON, with the version of the suite; paths as text. Raises ValueError for NaN."""
+def write_json(path: str | Path | None, content: dict[str, Any]) -> None:
+    """Write a dict as JSON, with the version of the suite; without a path, write nothing.
+
+    Paths become text. Raises ValueError for NaN.
+    """
+    if path is None:
+        return
     whole = {"written_by": written_by(), **content}
     text = json.dumps(whole, indent=1, allow_nan=False, default=os.fspath)
     write_text(path, text + "\n")

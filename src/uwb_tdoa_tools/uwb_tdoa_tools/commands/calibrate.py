@@ -4,23 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options, parallel
 from ..cli import option
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from uwb_tdoa_ekf.core.config import FilterConfig
-
-    from ..calibrating import Calibration
 
 DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
 
@@ -138,57 +129,25 @@ def _calibrate(args: Namespace) -> int:
     cli.write_json(
         out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()}
     )
+    more = options.words_of_reading(args)
     if made.why_not is not None:
         cli.show(f"wrote calibration.json, the figures of this, to {out}")
-        more = options.words_of_reading(args)
         cli.show(
             *command_lines.lines_without_use(paths, args.survey, args.effects, all(known), more)
         )
         return _stop(made.why_not)
-    imu = has_imu([*flights, *holdout])
-    return _write(made, config, args, judges or paths, all(known), imu)
+    files = made.save(out, config, has_imu([*flights, *holdout]))
+    written = ", ".join(file.name for file in files if file)
+    cli.show(f"wrote {written} and calibration.json to {out}")
+    judging = command_lines.evaluate_line(judges or paths, *files, all(known), more)
+    cli.show(f"judge it:   {judging}")
+    cli.show("start the nodes with it:", *command_lines.node_lines(*files))
+    return 0
 
 
 def _stop(why: str) -> int:
     cli.say("calibrate", f"stopped, and nothing to use is written: {why}.")
     return 1
-
-
-def _write(
-    made: Calibration,
-    config: FilterConfig,
-    args: Namespace,
-    recordings: Sequence[str | Path],
-    truth: bool,
-    imu: bool,
-) -> int:
-    """Write the files of a Calibration, print the lines that use them, and return the exit code.
-
-    recordings : hold-out data, or all flights without any; truth : whether they have ground truth
-    imu : whether a recording has inertial samples
-    """
-    from ..diagnosis.noise import write_parameters
-
-    out = args.out
-    files = anchors, effects, parameters = (
-        out / "anchors.yaml",
-        out / "effects.yaml",
-        out / "ekf_node.yaml",
-    )
-    made.anchors.to_yaml(anchors)
-    made.effects.to_yaml(effects)
-    # no file, and an earlier one removed, if all parameters have their defaults
-    write_parameters(parameters, made.tdoa_std, config, imu)
-    survey, corrected, tuned = (file if file.exists() else None for file in files)
-    cli.show(
-        f"wrote {', '.join(file.name for file in files if file.exists())} and "
-        f"calibration.json to {out}"
-    )
-    more = options.words_of_reading(args)
-    judging = command_lines.evaluate_line(recordings, survey, corrected, tuned, truth, more)
-    cli.show(f"judge it:   {judging}")
-    cli.show("start the nodes with it:", *command_lines.node_lines(survey, corrected, tuned))
-    return 0
 
 
 main = cli.executable(_calibrate, parser)

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Iterator
 
-    from uwb_tdoa_bias.common.anchors import Anchors
-
     from ..checking.recording import Recording
     from ..readers.inputs import Reading
 
@@ -66,6 +64,8 @@ def parser() -> ArgumentParser:
 
 
 def _check(args: Namespace) -> int:
+    from uwb_tdoa_bias.common.survey import read_named_anchors
+
     from ..checking import report
     from ..checking.check import check, different_surveys
     from ..estimate import FlightEstimator
@@ -76,7 +76,8 @@ def _check(args: Namespace) -> int:
         raise InputError(f"--live: {args.live:g} must be a number of seconds above 0, e.g. 60.")
     reading, estimator = options.reading_of(args), FlightEstimator(*options.filter_of(args))
     surveys = Path(args.survey) if args.survey else None
-    others = _surveys(surveys) if surveys and surveys.is_dir() else []
+    folder = sorted(surveys.glob("anchor_?*")) if surveys and surveys.is_dir() else []
+    others = [(str(path), read_named_anchors(path).anchors) for path in folder]
     alone = None if others else surveys
     reports, recordings = [], []
     for recording, path, survey in _recordings(args, reading, alone):
@@ -89,8 +90,7 @@ def _check(args: Namespace) -> int:
     together = list(different_surveys(recordings))
     for finding in together:
         cli.show(*report.lines(finding))
-    if args.json:
-        cli.write_json(args.json, report.as_dict(reports, together))
+    cli.write_json(args.json, report.as_dict(reports, together))
     return int(any(one.faulty for one in reports))
 
 
@@ -112,15 +112,6 @@ def _recordings(
             cli.say("check", *(f"{path}: {remark}" for remark in recording.remarks))
             yield recording, path, its_survey
             progress.update()
-
-
-def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
-    """Return [(path, Anchors)] of a folder of surveys."""
-    from uwb_tdoa_bias.common.survey import read_named_anchors
-
-    return [
-        (str(path), read_named_anchors(path).anchors) for path in sorted(folder.glob("anchor_?*"))
-    ]
 
 
 main = cli.executable(_check, parser)

@@ -4,22 +4,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
 from ..cli import OutputFile, option
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-
-    from uwb_tdoa_ekf.debias import BiasMap
-
-    from ..debiasing import PositionEstimator
-    from ..readers.inputs import Recording
 
 DESCRIPTION = """Map the bias of estimated positions in x and y, after Grasso et al. (Sensors 2022, 22, 9136), and
 take it out.
@@ -120,20 +112,21 @@ def _fit(args: Namespace) -> int:
     figures: dict[str, Any] = {
         "map": debiasing.map_figures(made),
         "fitted": debiasing.comparison_rows(fitted, made, estimator.effects),
+        "borne_out": shrinkage.as_dict() if shrinkage else None,
     }
-    figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
     debiasing.print_rows("in sample", figures["fitted"])
     refusals = []
     if shrinkage and not shrinkage.gains.mean() >= debiasing.SMALLEST_GAIN:
         refusals.append(debiasing.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
-        figures["held out"] = _judged(args, estimator, held, made)
+        flown = parallel.over(estimator, held, args.jobs, args.dask)
+        figures["held out"] = debiasing.comparison_rows(flown, made, estimator.effects)
         debiasing.print_rows("held out", figures["held out"])
         gained = debiasing.mean_gain(figures["held out"])
         cli.show(debiasing.verdict(gained, "flights held out"))
         refusals += [debiasing.verdict(gained, "flights held out")] * debiasing.does_harm(gained)
     figures["written"] = not refusals
-    _write(args.json, figures)
+    cli.write_json(args.json, figures)
     if refusals:
         cli.show(f"{args.out} is not written: {refusals[0]}")
         return 1
@@ -151,26 +144,14 @@ def _judge(args: Namespace) -> int:
         options.reading_of(args), *options.filter_of(args), args.align
     )
     made = BiasMap.load(args.map)
-    rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
+    found = estimator.reading.find(args.flights, bool(args.dask))
+    flown = parallel.over(estimator, found, args.jobs, args.dask)
+    rows = debiasing.comparison_rows(flown, made, estimator.effects)
     debiasing.print_rows("flight", rows)
     gained = debiasing.mean_gain(rows)
     cli.show(debiasing.verdict(gained, "these flights"))
-    _write(args.json, {"map": debiasing.map_figures(made), "runs": rows, "gain": gained})
+    cli.write_json(args.json, {"map": debiasing.map_figures(made), "runs": rows, "gain": gained})
     return int(debiasing.does_harm(gained))
-
-
-def _judged(
-    args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
-) -> list[dict[str, Any]]:
-    from .. import debiasing
-
-    flown = parallel.over(estimator, recordings, args.jobs, args.dask)
-    return debiasing.comparison_rows(flown, made, estimator.effects)
-
-
-def _write(path: str | Path | None, figures: dict[str, Any]) -> None:
-    if path is not None:
-        cli.write_json(path, figures)
 
 
 main = cli.executable(lambda args: {"fit": _fit, "judge": _judge}[args.command](args), parser)

@@ -107,8 +107,7 @@ def _loop(args: Namespace) -> int:
     )
     if args.rerun is not None and not result.missing:
         result.show(args.rerun)
-    if args.json is not None:
-        cli.write_json(args.json, figures)
+    cli.write_json(args.json, figures)
     _show("next", demo.next_steps(args.out / "flight-3_bag"), keep=True)
     return int(result.failed)
 
@@ -119,11 +118,6 @@ def _show(title: str, lines: Sequence[str], keep: bool = False) -> None:
         begin = f"{'' if number else title:{INDENT}s}"
         width = len(line) + INDENT if keep else WIDTH
         cli.show(textwrap.fill(line, width, initial_indent=begin, subsequent_indent=" " * INDENT))
-
-
-def _progress(text: str) -> None:
-    """Print a line of progress of the nodes."""
-    cli.show(f"nodes      {text}")
 
 
 def _measured(args: Namespace) -> int:
@@ -145,7 +139,15 @@ def _measured(args: Namespace) -> int:
     )
     cli.show(f"correction {demo.correction_in_words(correction, args.effects, args.model)}")
     files = {"effects_file": args.effects, "model_file": args.model}
-    live, scores = demo.fly(flight, correction, files, args.out, args.rate, args.rerun, _progress)
+    live, scores = demo.fly(
+        flight,
+        correction,
+        files,
+        args.out,
+        args.rate,
+        args.rerun,
+        lambda text: cli.show(f"nodes      {text}"),
+    )
     _show("nodes", demo.arrivals_in_words(flight, live.outcome))
     if live.missing:
         _show("error", [demo.too_slow_in_words(live.missing, args.rate)])

@@ -4,9 +4,9 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
@@ -15,11 +15,6 @@ from .. import cli, command_lines, options, parallel
 from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES, TAPE_STD
 from ..cli import exclusive, option
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-
-    from ..diagnosis.constraints import Distance, Mark, OdometryPath
 
 DESCRIPTION = """Find systematic errors in the measurements of some flights, and correct them.
 
@@ -180,12 +175,15 @@ def _diagnose(args: Namespace) -> int:
     for name in ("marks", "odometry"):
         if args.reference == name and getattr(args, name) is None:
             raise InputError(f"--reference {name}: --{name} says which, and is missing.")
-    known: tuple[Mark | Distance | OdometryPath, ...] = options.known_of(args, (*flights, *holdout))
-    if args.odometry is not None:
-        known = (
-            *known,
-            *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace),
-        )
+    every = (*flights, *holdout)
+    known = (
+        *options.known_of(args, every),
+        *(
+            read_paths(args.odometry, every, args.drift, args.namespace)
+            if args.odometry is not None
+            else ()
+        ),
+    )
     reference = references.REFERENCES[args.reference](
         config, known, *[args.align][: args.reference == "truth"]
     )

@@ -116,10 +116,9 @@ def _evaluate(args: Namespace) -> int:
         "", *evaluating.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned)
     )
     cli.show(*evaluating.lines_of_attitude(pool.attitudes))
-    if args.json:
-        cli.write_json(
-            args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}
-        )
+    cli.write_json(
+        args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}
+    )
     if late := evaluator.late_tdoas():
         cli.say(
             "evaluate",

@@ -206,8 +206,7 @@ def _fly(args: argparse.Namespace) -> int:
     verdicts, pictures = zip(*parallel.over(one, tasks, args.jobs, args.dask))
     summed = summary(verdicts)
     cli.show(text(summed))
-    if args.json is not None:
-        cli.write_json(args.json, {"summary": summed, "flights": verdicts})
+    cli.write_json(args.json, {"summary": summed, "flights": verdicts})
     if args.plot is not None:
         verdict.plot(pictures, world.anchors, args.plot)
     return int(summed[wording_of(summed).goal] < args.at_least)

@@ -87,8 +87,7 @@ def _localize(args: Namespace) -> int:
         first, *others = one.assessment.sentences()
         cli.show(f"{one.flight}: {first}", *(f"  {sentence}" for sentence in others))
         cli.show(f"  wrote {', '.join(path.name for path in one.written)} to {out}")
-    if args.json:
-        cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
+    cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
     return int(not all_good(located))
 
 

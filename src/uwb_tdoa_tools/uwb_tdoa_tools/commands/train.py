@@ -4,20 +4,13 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from functools import partial
-from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..choices import MODELS
 from ..cli import OutputFolder, option
-from ..parallel import MapFunction, Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.flight import Flight
-
+from ..parallel import Progress
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
 
@@ -70,39 +63,28 @@ def parser() -> ArgumentParser:
 def _train(args: Namespace) -> None:
     from ..readers import inputs
     from ..scoring.evaluation import with_aligned_truth
+    from ..scoring.metrics import gain_in_words
+    from ..training import labels as labelling, models
 
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
     jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), 2)
     # Only Progress prints a line.
     over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
-    flights = reading.flights(args.flights, args.most, jobs, dask)
-    inputs.require_tdoas(flights, "train")
-    flights = list(
-        parallel.over(partial(with_aligned_truth, align=args.align), flights, jobs, dask)
-    )
-    with Progress("train") as progress:
-        _write(args, flights, over, progress)
-
-
-def _write(
-    args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
-) -> None:
-    """Train on several Flights, and write all results. over : as in `models.train_shrunk`."""
-    from ..scoring.metrics import gain_in_words
-    from ..training import labels as labelling, models
-
-    flights = {flight.name: flight for flight in several}
+    several = reading.flights(args.flights, args.most, jobs, dask)
+    inputs.require_tdoas(several, "train")
+    aligned = parallel.over(partial(with_aligned_truth, align=args.align), several, jobs, dask)
+    flights = {flight.name: flight for flight in aligned}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         cli.show(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
-    progress(f"training on {len(training)} flights, then without each")
     recipe = models.Recipe(args.model, args.seed)
-    result, shrinkage = models.train_shrunk(
-        recipe, training, validation, name, progress=cli.show, map_function=over
-    )
+    with Progress("train", what=f"training on {len(training)} flights, then without each"):
+        result, shrinkage = models.train_shrunk(
+            recipe, training, validation, name, progress=cli.show, map_function=over
+        )
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, of_training, of_validation = result.curve

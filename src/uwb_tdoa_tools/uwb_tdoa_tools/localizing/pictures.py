@@ -93,20 +93,22 @@ def write_residuals(path: Path, residuals: Residuals) -> None:
 
     Cells are empty if the filter had no innovation.
     """
-    lines, std = [",".join(RESIDUAL_COLUMNS)], np.sqrt(residuals.variance)
     rows = zip(
         residuals.t,
         residuals.a,
         residuals.b,
         residuals.innovation,
-        std,
+        np.sqrt(residuals.variance),
         residuals.weight,
         residuals.verdict,
     )
-    for t, a, b, value, its_std, weight, verdict in rows:
-        numbers = f"{value:.4f},{its_std:.4f},{weight:.3f}" if np.isfinite(value) else ",,"
-        lines.append(f"{t:.6f},{int(a)},{int(b)},{numbers},{VERDICTS[int(verdict)]}")
-    write_text(path, "\n".join([*lines, ""]))
+    lines = (
+        f"{t:.6f},{int(a)},{int(b)},"
+        f"{f'{value:.4f},{std:.4f},{weight:.3f}' if np.isfinite(value) else ',,'},"
+        f"{VERDICTS[int(verdict)]}"
+        for t, a, b, value, std, weight, verdict in rows
+    )
+    write_text(path, "\n".join([",".join(RESIDUAL_COLUMNS), *lines, ""]))
 
 
 def draw_residuals(path: Path, residuals: Residuals, title: str) -> None:
@@ -226,15 +228,12 @@ def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone
 
 def write_zones(path: Path, zones: list[Zone]) -> None:
     """Write one CSV line per Zone, with the columns ZONE_COLUMNS and anchors as "id:share"."""
-    lines = [",".join(ZONE_COLUMNS)]
-    for zone in zones:
-        numbers = [f"{getattr(zone, name):.3f}" for name in ZONE_COLUMNS[:-1]]
-        lines.append(
-            ",".join(
-                [*numbers, " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)]
-            )
-        )
-    write_text(path, "\n".join([*lines, ""]))
+    lines = (
+        "".join(f"{getattr(zone, name):.3f}," for name in ZONE_COLUMNS[:-1])
+        + " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)
+        for zone in zones
+    )
+    write_text(path, "\n".join([",".join(ZONE_COLUMNS), *lines, ""]))
 
 
 def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
@@ -436,26 +435,23 @@ def write_rerun(
         rerun.Points3D(anchors.positions, labels=labels, radii=0.06, colors=BLACK),
         static=True,
     )
-    stream.log(
-        "world/path", rerun.LineStrips3D([odometry.p], colors=BLUE, radii=0.005), static=True
-    )
+    for name, path_of, colour in (
+        ("path", odometry, BLUE),
+        ("truth", truth, GREY),
+        ("before", before, ORANGE),
+    ):
+        if path_of is not None:
+            line = rerun.LineStrips3D([path_of.p], colors=colour, radii=0.005)
+            stream.log(f"world/{name}", line, static=True)
     stream.log(
         "verdict", rerun.TextDocument("\n\n".join(verdict), media_type="text/markdown"), static=True
     )
-    if truth is not None:
-        stream.log(
-            "world/truth", rerun.LineStrips3D([truth.p], colors=GREY, radii=0.005), static=True
-        )
     _write_poses(rerun, stream, odometry, begin)
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance[:, :3, :3]))
     for k, axis in enumerate("xyz"):
         _write_scalars(rerun, stream, f"deviation/{axis}", odometry.t - begin, std[:, k])
     for one in by_pair(residuals) if residuals is not None else ():
         _write_scalars(rerun, stream, f"residual/{one.a}-{one.b}", one.t - begin, one.value)
-    if before is not None:
-        stream.log(
-            "world/before", rerun.LineStrips3D([before.p], colors=ORANGE, radii=0.005), static=True
-        )
     if truth is not None:
         for name, estimate in (("error", odometry), ("error/before", before)):
             if estimate is not None:
