@@ -162,13 +162,13 @@ def late(flight, rows=(0, 2), since=40.0, lasts=5.0, by=1.5):
 def misled(flight, fault, since=28.0, lasts=8.0):
     """Return the Flight with wheels that are wrong from `since` s after its begin, for `lasts` s.
 
-    They "stick", "spin" 0.6 m/s too fast, or turn "twice" as fast.
+    They "stick", "spin" 0.6 m/s too fast, turn "twice" as fast, or report the "opposite" direction.
     """
     wheels, t = flight.velocity, flight.velocity.t - flight.truth.t[0]
     during, v, yaw_rate = (t > since) & (t < since + lasts), wheels.v.copy(), wheels.yaw_rate.copy()
-    factor = {"stick": 0.0, "spin": 1.0, "twice": 2.0}[fault]
+    factor = {"stick": 0.0, "spin": 1.0, "twice": 2.0, "opposite": -1.0}[fault]
     v[during] *= factor
-    yaw_rate[during] *= factor
+    yaw_rate[during] *= abs(factor)
     v[during, 0] += 0.6 * (fault == "spin")
     return replace(flight, velocity=replace(wheels, v=v, yaw_rate=yaw_rate))
 

@@ -304,10 +304,13 @@ def test_a_rover_that_is_lost_is_found(config=WHEELS):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fault", ["stick", "spin", "twice"])
+@pytest.mark.parametrize("fault", ["stick", "spin", "twice", "opposite"])
 @pytest.mark.parametrize("every", [1, 5])
 def test_wheels_that_tdoas_contradict_are_left_out_named_and_taken_again(fault, every):
-    """Without an IMU, at 100 and 20 TDOAs/s, the wheels are wrong from 28 to 36 s."""
+    """Without an IMU, at 100 and 20 TDOAs/s, the wheels are wrong from 28 to 36 s.
+
+    In the opposite direction they lead farther. The yaw does not follow them.
+    """
     drove = drive(1, SHORT)
     flight = misled(replace(drove, tdoa=rows_of(drove.tdoa, slice(None, None, every))), fault)
     estimator, begin, named = Estimator(flight.anchors, WHEELS), flight.truth.t[0], []
@@ -320,7 +323,8 @@ def test_wheels_that_tdoas_contradict_are_left_out_named_and_taken_again(fault, 
     odometry, _ = feed(estimator, flight, advance=look)
     found = Errors(flight, odometry, SETTLED)
     step = np.median(np.diff(found.t))
-    assert np.sum(found.xy > 0.5) * step < 2.0
+    assert np.sum(found.xy > 0.5) * step < (4.0 if (fault, every) == ("opposite", 5) else 2.0)
+    assert not np.any((found.yaw_std < YAW_KNOWN) & (np.abs(found.yaw) > 3.0 * YAW_KNOWN))
     assert 28.5 < min(named) < 31.0 and max(named) < 40.0
     wheels = run_offline(flight, WHEELS).sensors["velocity"]
     t, used = flight.velocity.t - begin, wheels["verdict"] == USED

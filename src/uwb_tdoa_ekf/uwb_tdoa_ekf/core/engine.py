@@ -314,8 +314,7 @@ def _prepare(
     """
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            window = initialization.recent(ekf, stationarity.LOOK_WINDOW)
-            stationarity.check_stationarity(ekf, anchors, parameters, window, t, records)
+            stationarity.check_stationarity(ekf, anchors, parameters, t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             stationarity.update_zero_velocity(ekf, t, records)
     if t >= ekf.velocity.next_look:

@@ -185,6 +185,9 @@ VELOCITY = _record(
     ("path_until", float),
     ("path_velocity", float, 3),
     ("contradicted", bool),  # TDOAs contradict the path
+    # rad, heading of the body minus that of the path when TDOAs last confirmed it; s, stamp of that
+    ("heading", float),
+    ("confirmed", float),
     ("next_look", float),  # s, stamp of the next comparison
 )
 
@@ -404,7 +407,7 @@ def new_state(
         (ekf.imu_fault_detector, ("contradicted",)),
         (ekf.height, ("heard", "changed", "used", "compared", "pulls_since", "ignored_until")),
         (ekf.barometer, ("heard", "agreed")),
-        (ekf.velocity, ("heard", "changed", "agreed", "path_until", "next_look")),
+        (ekf.velocity, ("heard", "changed", "agreed", "path_until", "confirmed", "next_look")),
         (ekf.ranged, ("t",)),
         (ekf.yaw_test, ("next_look", "opened")),
     ):

@@ -16,6 +16,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
 from .inertial import SHAKING_MEMORY
+from .initialization import recent
 from .memory import HYPOTHESES
 from .state import CHECK_PERIOD, CONSTRAINT_PERIOD, GRAVITY, rotation
 from .stationary_position import SPEED_STD
@@ -23,7 +24,8 @@ from .update import GATE, kalman_direct
 
 # m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
-LOOK_WINDOW = 0.4  # s of TDOAs in each check
+# s of TDOAs in each check: the shorter window, or, if its TDOAs of a pair are too few, the longer
+LOOK_WINDOW, LONG_WINDOW = (0.4, 1.6)
 # checks in a row with changed TDOAs that end a rest: a check shows a change by chance in 1 of 20
 # cases; checks in a row without a change that begin a rest within EARLY
 FEWEST_CHECKS = 3
@@ -86,11 +88,10 @@ def check_stationarity(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
-    window: np.ndarray,
     t: float,
     records: np.ndarray,
 ) -> None:
-    """Detect whether the tag is at rest, from a window of TDOAs.
+    """Detect whether the tag is at rest, from its last TDOAs.
 
     Call not before ekf.next_look. The function sets ekf.resting. A tag that has landed is moved to
     its estimated position on the ground.
@@ -103,8 +104,6 @@ def check_stationarity(
         All anchors, by row.
     parameters : PARAMETERS
         Tuning of the filter.
-    window : (n,) TDOA
-        TDOAs of the last LOOK_WINDOW seconds, up to stamp t.
     t : float
         Stamp, s.
     records : (n,) RECORD
@@ -115,8 +114,12 @@ def check_stationarity(
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
     if not (ekf.resting or calm or stationary_position.is_near_ground(best, parameters)):
         return
-    count = ground.find_pairs(window, ekf.pairs)
-    motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x[:3], ekf.still_covariance)
+    count, motion = 0, ground.UNKNOWN
+    for seconds in (LOOK_WINDOW, LONG_WINDOW):
+        if motion == ground.UNKNOWN:
+            count = ground.find_pairs(recent(ekf, seconds), ekf.pairs)
+            pairs, covariance = ekf.pairs[:count], ekf.still_covariance
+            motion = ground.judge_motion(pairs, anchors, best.x[:3], covariance)
     still = motion == ground.STILL
     # too few TDOAs and a quiet IMU give no evidence
     unshown = motion == ground.UNKNOWN and ekf.quiet

@@ -55,6 +55,7 @@ SECONDS, FEWEST, PERIOD = (2.0, 24, 0.25)
 # 61 variances with 0.05 m, or 25 with 0.15 m.
 SHOWN, LARGE = (30.0, 0.1)
 SCALES = (0.85, 1.0, 1.15)  # of a velocity that is right
+TURNED = 10.0  # s after which the opposite of a confirmed heading is that of a tag that was turned
 LED = 0.3  # m from TDOAs beyond which wrong wheels have led the filter away
 HEADINGS = 2.0 * math.pi / 48.0 * np.arange(48)  # rad
 # entries of a fit with any acceleration and of one along the path, see `_accumulate`
@@ -234,19 +235,26 @@ def compare_path(
     needed = max(SHOWN * variance, n * (LARGE**2 + state.speed_variance))
     for k in range(3):  # the place
         of_path -= np.outer(of_path[k] / of_path[k, k], of_path[k])
-    costs = np.array([_cost(of_path, heading) for heading in HEADINGS])
-    least = np.min(costs)
+    costs = np.array([_cost(of_path, angle) for angle in HEADINGS])
+    least, heading = np.min(costs), yaw_of(x) - window[n - 1].pose[2]
     if variance > std**2:  # late anchors may make the difference
         return 0.0
-    contradicted = least - free > (0.5 if state.contradicted else 1.0) * needed
+    turns = _cost(of_path, heading) - least >= needed
+    # a body does not turn round at once: wheels report the opposite direction
+    opposite = _cost(of_path, state.heading + math.pi) - least < needed
+    opposite &= t - state.confirmed < TURNED and _cost(of_path, state.heading) - least >= needed
+    contradicted = opposite or least - free > (0.5 if state.contradicted else 1.0) * needed
     away = math.hypot(np.sum(fit[:3]) - x[0], np.sum(fit[3:6]) - x[1])
     if contradicted and not state.contradicted and agrees(state, t, SLIP) and away > LED:
         ekf.distrusted = True
     state.contradicted = contradicted
-    heading = yaw_of(x) - window[n - 1].pose[2]
-    if contradicted or state.refused or _cost(of_path, heading) - least < needed:
+    if contradicted or state.refused:
         return 0.0
-    return HEADINGS[np.argmin(costs)] - heading
+    if turns:
+        return HEADINGS[np.argmin(costs)] - heading
+    if np.max(costs) - least >= needed:
+        state.heading, state.confirmed = heading, t
+    return 0.0
 
 
 @compiled
