@@ -19,7 +19,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from .anchor_table import MOST_ROWS, AnchorTable
 from .core import height, sensors
 from .core.config import FilterConfig
-from .core.engine import INCONSISTENT
+from .core.engine import INCONSISTENT, RECOVERY_NAMED
 from .core.initialization import LOST_TIME
 from .core.memory import (
     INVALID,
@@ -41,7 +41,6 @@ from .results import VERDICTS, Odometry, Residuals, concatenated
 # s, largest lead of a pose that the user sets over the newest measurement
 LARGEST_POSE_AHEAD = 10.0
 RESTART_NAMED = 10.0  # s of stamps for which /diagnostics reports a restart
-RECOVERY_NAMED = 5.0  # s of stamps for which `status` reports a recovery
 LEAST_POSE_STD = 1e-3  # m, and rad; the covariance of the filter must stay positive definite
 MOST_POSES = 100  # poses that may wait for their stamp
 NOTHING = (

@@ -61,6 +61,8 @@ from .startup import INLIER
 from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
 from .update import project
 
+# s for which `status` reports a recovery, after a single yaw is left
+RECOVERY_NAMED = 5.0
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
 UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
 MAX_STEP = 0.05  # s, longest single prediction
@@ -721,6 +723,9 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
+    settled = not ekf.sensed or (hypotheses.alike(ekf) and yaw_check.known(best.x, best.P))
+    if t - ekf.recovered < RECOVERY_NAMED and not settled:
+        ekf.recovered = t
     workspace.add_circle(
         ekf,
         parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.MEMORY,

@@ -252,6 +252,7 @@ def _settle(
         height.level -= height.disagreement
         return True
     if trusted:  # no step is so high, and the filter was right: the range finder is wrong
+        _ignore(height, t)
         return False
     height.level, height.agreed = parameters.ground_height, 0.0
     for h in range(len(ekf.hypotheses)):
@@ -295,9 +296,15 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
     if abs(height.pull) < PULL_LIMIT * height.pull_information:
         height.pulls_since = t
     elif ranged and t - height.pulls_since > IGNORE_TIME:
-        height.ignore_time = min(max(IGNORE_TIME, 2.0 * height.ignore_time), LONGEST_IGNORED)
-        height.ignored_until = t + height.ignore_time
-        height.agreed = 0.0
+        _ignore(height, t)
+
+
+@compiled
+def _ignore(height: Record, t: float) -> None:
+    """Ignore the range finder from stamp t (s) on, twice as long as the last time."""
+    height.ignore_time = min(max(IGNORE_TIME, 2.0 * height.ignore_time), LONGEST_IGNORED)
+    height.ignored_until = t + height.ignore_time
+    height.agreed = 0.0
 
 
 @compiled

@@ -146,18 +146,20 @@ def contradicts(ekf: Record, t: float) -> bool:
     doubt.next_look = t + CHECK_PERIOD
     measured = t - ekf.velocity.heard < HEARD
     unconfirmed = measured and doubt.unconfirmed > 0.0
-    return (
-        accumulate(doubt, measured) > (UNCONFIRMED_EVIDENCE if unconfirmed else EVIDENCE)
-        and _yaw_variance(ekf.hypotheses[ekf.best]) < YAW_KNOWN**2
-    )
+    limit = UNCONFIRMED_EVIDENCE if unconfirmed else EVIDENCE
+    best = ekf.hypotheses[ekf.best]
+    return accumulate(doubt, measured) > limit and known(best.x, best.P)
 
 
 @compiled
-def _yaw_variance(hypothesis: Record) -> float:
-    """Return the variance of the rotation about the vertical of the world, in rad^2."""
-    x, P = hypothesis.x, hypothesis.P
+def known(x: np.ndarray, P: np.ndarray) -> bool:
+    """Return whether the yaw counts as known, for a state x and the covariance P of its errors.
+
+    The variance is that of the rotation about the vertical of the world.
+    """
     u0 = 2.0 * (x[6] * x[8] - x[9] * x[7])
     u1 = 2.0 * (x[7] * x[8] + x[9] * x[6])
     u2 = 1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2)
     square = u0 * u0 * P[6, 6] + u1 * u1 * P[7, 7] + u2 * u2 * P[8, 8]
-    return square + 2.0 * (u0 * u1 * P[6, 7] + u0 * u2 * P[6, 8] + u1 * u2 * P[7, 8])
+    square += 2.0 * (u0 * u1 * P[6, 7] + u0 * u2 * P[6, 8] + u1 * u2 * P[7, 8])
+    return square < YAW_KNOWN**2
