@@ -10,7 +10,16 @@ from importlib import import_module
 from importlib.util import module_from_spec
 
 from covariances import assert_covariance
-from flights import corners, fly, measurements, position_at, rms_error, with_ranges, with_sensors
+from flights import (
+    corners,
+    errors_of,
+    fly,
+    measurements,
+    position_at,
+    rms_error,
+    with_ranges,
+    with_sensors,
+)
 from hypothesis import given, settings, strategies as st
 from live import assert_same
 import numpy as np
@@ -445,17 +454,25 @@ def test_wheels_that_stand_may_repeat_zero():
     assert (run_offline(zero).sensors["velocity"]["verdict"][t > 2.0] == USED).mean() > 0.9
 
 
-def test_a_fixed_height_of_a_tag_that_flies_is_contradicted_by_tdoas_and_the_deviation_covers_that():
+@pytest.mark.parametrize("off", [1.4, -0.8, 0.0])
+def test_a_fixed_height_that_tdoas_contradict_is_left_and_one_that_they_do_not_holds(off):
     flight = fly(4, 12.0, hover=True, tdoa_std=0.15)
     z = flight.truth.p[0, 2]
-    for off, covered in ((1.4, True), (0.0, False)):
-        odometry = run_offline(
-            flight, FilterConfig(fixed_height=float(z - off), fixed_height_std=0.05)
-        ).odometry
-        late = odometry.t > 4.0
-        error = np.abs(odometry.p[late, 2] - position_at(flight, odometry.t[late])[:, 2])
-        stated = np.sqrt(odometry.covariance[late, 2, 2])
-        assert (error < 3.0 * stated + 0.01).all() and (stated.max() > 0.4) == covered
+    config = FilterConfig(fixed_height=float(z - off), fixed_height_std=0.05)
+    odometry = run_offline(flight, config).odometry
+    error = np.abs(odometry.p[:, 2] - position_at(flight, odometry.t)[:, 2])
+    stated = np.sqrt(odometry.covariance[:, 2, 2])
+    late = odometry.t > 4.0
+    assert (error < 3.0 * stated + 0.01)[late].all() and error[late].max() < 0.5
+    assert (stated[late].max() < 0.1) == (off == 0.0)
+
+
+def test_a_tag_in_a_lift_is_not_held_at_the_height_that_it_passes():
+    flight = fly(4, 40.0, tdoa_rate=50.0)
+    z = flight.truth.p[:, 2]
+    config = FilterConfig(fixed_height=float(np.mean(z)), fixed_height_std=0.05)
+    errors, nees = errors_of(flight, run_offline(flight, config).odometry, after=10.0)
+    assert np.ptp(z) > 1.2 and np.sqrt(np.mean(errors[:, 2] ** 2)) < 0.1 and nees.mean() < 6.0
 
 
 # --- sensor functions ---

@@ -188,7 +188,9 @@ class Estimator:
                 "look for what has changed in TDOAs or IMU"
             )
         if ekf.t < ekf.height.ignored_until:
-            return "TDOAs contradict the range finder, and it is not used: check it, height_std"
+            held = self.config.known_height_std > 0.0
+            of = "fixed_height" if held else "the range finder"
+            return f"TDOAs contradict {of}, and it is not used: check it and its deviation"
         if ekf.velocity.contradicted:
             return "TDOAs contradict the wheels, and they are not used: check if they slip or stick"
         return None

@@ -255,13 +255,17 @@ def _settle(
         _ignore(height, t)
         return False
     height.level, height.agreed = parameters.ground_height, 0.0
-    for h in range(len(ekf.hypotheses)):
-        hypothesis = ekf.hypotheses[h]
-        if alive(hypothesis):
-            hypothesis.P[2, 2] += base_innovation**2
-            hypothesis.P[5, 5] += 1.0
-    add_reset(ekf, t, records)
+    _widen(ekf, base_innovation, t, records)
     return True
+
+
+@compiled
+def _widen(ekf: Record, error: float, t: float, records: np.ndarray) -> None:
+    """Widen the covariance of a height that is wrong by about `error` (m) at stamp t (s)."""
+    for hypothesis in ekf.hypotheses:
+        hypothesis.P[2, 2] += error**2
+        hypothesis.P[5, 5] += 1.0
+    add_reset(ekf, t, records)
 
 
 @compiled
@@ -301,7 +305,7 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
 
 @compiled
 def _ignore(height: Record, t: float) -> None:
-    """Ignore the range finder from stamp t (s) on, twice as long as the last time."""
+    """Ignore what holds the height from stamp t (s) on, twice as long as the last time."""
     height.ignore_time = min(max(IGNORE_TIME, 2.0 * height.ignore_time), LONGEST_IGNORED)
     height.ignored_until = t + height.ignore_time
     height.agreed = 0.0
@@ -334,6 +338,29 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
     ):
         return 0.0
     return height.pull / height.pull_information
+
+
+@compiled
+def holds(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
+    """Return whether the fixed height holds the tag at stamp t (s).
+
+    After TDOAs have contradicted it, it does not for a while, longer each time, nor until the tag is
+    there again, and does not rise or sink. A planar vehicle is always held.
+    """
+    height, best, std = ekf.height, ekf.hypotheses[ekf.best], parameters.fixed_height_std
+    if std == 0.0 or parameters.planar:
+        return std > 0.0
+    if t < height.ignored_until:
+        return False
+    wrong, apart = contradiction(height, parameters, t), best.x[2] - parameters.fixed_height
+    if wrong != 0.0:
+        _ignore(height, t)
+        _widen(ekf, wrong, t, records)
+        return False
+    if height.ignored_until > -np.inf:
+        returned = apart**2 < best.P[2, 2] + std**2 and best.x[5] ** 2 < best.P[5, 5]
+        height.ignored_until = -np.inf if returned else t + MEMORY
+    return height.ignored_until == -np.inf
 
 
 @compiled

@@ -16,7 +16,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from . import hypotheses, velocity
+from . import height, hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
 from .state import CONSTRAINT_PERIOD, rotation, yaw_of
@@ -54,11 +54,12 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
         ekf.sensed or velocity.agrees(ekf.velocity, t, velocity.HELD)
     )
     alike = 2.0 * velocity.CORRELATION_TIME / CONSTRAINT_PERIOD
+    held = height.holds(ekf, parameters, t, records)
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
             continue
-        if std > 0.0 and hypothesis.P[2, 2] > std**2:
+        if held and hypothesis.P[2, 2] > std**2:
             kalman_direct(hypothesis, innovation, 2, parameters.fixed_height, std)
             add_update(ekf, h, t, records)
         if parameters.planar and hypothesis.P[5, 5] > RISE_STD**2:
