@@ -62,11 +62,14 @@ def test_a_volume(anchors, tmp_path, capsys):
                 "pairings",
                 "--out",
                 str(out),
+                "--json",
+                str(tmp_path / "copy.json"),
             ]
         )
         == 0
     )
     assert {path.name for path in out.iterdir()} == FILES
+    assert report(out) == json.loads((tmp_path / "copy.json").read_text())
     found = report(out)["map"]
     assert found["cells"] == [14, 16, 6] and 0.3 < found["flyable_share"] < 1.0
     assert sum(

@@ -16,7 +16,7 @@ from ..choices import (
     CRITERIA,
     OF_PROTOCOL,
 )
-from ..cli import OutputFolder, exclusive, group, option
+from ..cli import OutputFile, OutputFolder, exclusive, group, option
 
 ROUND = (
     "what a round holds: N TDOAs in a ring (tdoa2), TDOAs between any two of N anchors, each "
@@ -64,6 +64,7 @@ def parser() -> ArgumentParser:
                 required=True,
                 help="where to write; replaces what an earlier plan left there",
             ),
+            option("--json", metavar="FILE", type=OutputFile, help="write the figures here too"),
             group(
                 "where",
                 option(

@@ -92,6 +92,7 @@ def plan(args: Namespace) -> bool:
         figures["improve"] = improve(found, *aim, args.starts, args.out)
         report.print_improvement(figures["improve"])
     cli.write_json(args.out / "plan.json", figures)
+    cli.write_json(args.json, figures)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
     return bool(found.flyable.mean() >= args.share) or not args.hall
 
