@@ -139,10 +139,13 @@ def options(*argv):
 
 
 def test_few_items_run_in_one_process_by_default():
-    assert parallel.workers_for(options(), 4, 5) == (1, None)
-    assert parallel.workers_for(options(), 5, 5) == (min(cpu_count(), 5), None)
-    assert parallel.workers_for(options("--jobs", "2"), 4, 5) == (2, None)
-    assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
+    assert parallel.workers_for(options(), 4, 5)[:2] == (1, None)
+    assert parallel.workers_for(options(), 5, 5)[:2] == (min(cpu_count(), 5), None)
+    assert parallel.workers_for(options("--jobs", "2"), 4, 5)[:2] == (2, None)
+    assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5)[:2] == (
+        None,
+        "tcp://here:1",
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import cache
+from functools import cache, partial
 import os
 import signal
 import sys
@@ -147,16 +147,19 @@ class MapFunction(Protocol):
 
 def workers_for(
     args: argparse.Namespace, count: int, few: int = FEW
-) -> tuple[int | None, str | None]:
-    """Return (jobs, dask) for several calls of `over`, about `count` items.
+) -> tuple[int | None, str | None, MapFunction]:
+    """Return (jobs, dask) for several calls of `over`, about `count` items, and `over` with these.
+
+    That `over` shows no progress.
 
     Without options there are as many jobs as cores and items, and one for fewer items than `few`.
     """
     from joblib import cpu_count
 
-    if args.jobs or args.dask:
-        return args.jobs, args.dask
-    return (min(cpu_count(), count) if count >= few else 1), None
+    jobs, dask = args.jobs, args.dask
+    if not (jobs or dask):
+        jobs = min(cpu_count(), count) if count >= few else 1
+    return jobs, dask, partial(over, jobs=jobs, dask=dask, unit=None)
 
 
 def over(

@@ -116,8 +116,7 @@ def _calibrate(args: Namespace) -> int:
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
         judges = paths[-1:]
-    jobs, dask = parallel.workers_for(args, len(flights))
-    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
+    *_, over = parallel.workers_for(args, len(flights))
     with Progress("calibrate") as progress:
         if all(known):
             made = with_truth(flights, holdout, base, config, progress, over)

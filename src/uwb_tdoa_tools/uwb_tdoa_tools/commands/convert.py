@@ -4,11 +4,11 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_text
@@ -19,12 +19,6 @@ from ..choices import COLUMNS
 from ..cli import OutputBag, OutputFile, option
 from ..command_lines import tool
 from ..parallel import Progress
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
-    from collections.abc import Iterable
-
-    from ..readers.inputs import Reading
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
@@ -109,10 +103,21 @@ def _convert(args: Namespace) -> None:
     if not args.out:
         raise InputError("--out: is missing; give the path of the bag to write.")
     from ..converting import convert, described, shifted
+    from ..readers.profile import Profile, parse_columns
     from ..scoring.evaluation import on_one_clock
 
     offsets = _offsets(args.offsets)
-    reading = _reading(args)
+    reading = options.reading_of(args)
+    if args.columns:
+        because = "says where topics are in bags, and --columns is of CSV files"
+        options.refuse(args, ("namespace", "topics"), because)
+        options.refuse(args, ("profile",), "--columns is the short form of a profile")
+        if not args.survey:
+            raise InputError(
+                "--columns: CSV files do not say where the anchors are; give a survey file "
+                "(--survey FILE)."
+            )
+        reading = replace(reading, profile=Profile.of_columns(parse_columns(args.columns)))
     with Progress("convert", what="reading and writing"):
         made = convert(
             lambda: on_one_clock(shifted(reading.one(*args.input), offsets), args.align),
@@ -147,7 +152,7 @@ def _suggest(args: Namespace) -> None:
         cli.show(f"{YOUR_SURVEY} is the file with the positions of your anchors (docs/csv.md)")
 
 
-def _offsets(texts: Iterable[str]) -> dict[str, float]:
+def _offsets(texts: list[str]) -> dict[str, float]:
     """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
     offsets: dict[str, float] = {}
     for text in texts:
@@ -163,27 +168,6 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
             )
         offsets[sensor] = offset
     return offsets
-
-
-def _reading(args: Namespace) -> Reading:
-    """Return how to read IN. Raises InputError."""
-    from ..readers.profile import Profile, parse_columns
-
-    reading = options.reading_of(args)
-    if not args.columns:
-        return reading
-    options.refuse(
-        args,
-        ("namespace", "topics"),
-        "says where topics are in bags, and --columns is of CSV files",
-    )
-    options.refuse(args, ("profile",), "--columns is the short form of a profile")
-    if not args.survey:
-        raise InputError(
-            "--columns: CSV files do not say where the anchors are; give a survey file "
-            "(--survey FILE)."
-        )
-    return replace(reading, profile=Profile.of_columns(parse_columns(args.columns)))
 
 
 main = cli.executable(_convert, parser)

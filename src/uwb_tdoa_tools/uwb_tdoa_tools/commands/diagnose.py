@@ -162,7 +162,7 @@ def _diagnose(args: Namespace) -> int:
         return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
-    jobs, dask = parallel.workers_for(args, len(found))
+    jobs, dask, over = parallel.workers_for(args, len(found))
     flights, holdout = (
         reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
     )
@@ -196,8 +196,6 @@ def _diagnose(args: Namespace) -> int:
         if args.plan_flight
         else None
     )
-    # Only Progress prints a line.
-    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
     with Progress("diagnose") as progress:
         result = diagnose(
             flights, holdout, effects or EffectSet(), config, reference, progress, over

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from functools import partial
 
 from .. import cli, command_lines, options, parallel
 from ..parallel import Progress
@@ -81,8 +80,7 @@ def _survey(args: Namespace) -> int:
         max(tape.std, tape.height_std or 0.0),
     ):
         return 1
-    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)))
-    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # only Progress prints a line
+    jobs, dask, over = parallel.workers_for(args, len(reading.find(args.flights)))
     flights = reading.flights(args.flights, None, jobs, dask)
     remarks = remark_on_surveys([its for _, its in reading.find(args.flights)], flights)
     cli.say("survey", *remarks, *judge.remarks(flights[0].anchors))

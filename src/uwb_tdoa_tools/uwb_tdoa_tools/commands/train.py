@@ -68,9 +68,7 @@ def _train(args: Namespace) -> None:
 
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
-    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), 2)
-    # Only Progress prints a line.
-    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
+    jobs, dask, over = parallel.workers_for(args, len(reading.find(args.flights)), 2)
     several = reading.flights(args.flights, args.most, jobs, dask)
     inputs.require_tdoas(several, "train")
     aligned = parallel.over(partial(with_aligned_truth, align=args.align), several, jobs, dask)
