@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from uwb_tdoa_bias.common.arrays import Stamped
 from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
 from uwb_tdoa_bias.correction.corrector import known_yaw_std
@@ -36,7 +37,7 @@ OF_ROW = "innovation", "variance", "weight", "verdict"  # fields of memory.RESID
 
 
 @dataclass(frozen=True)
-class Residuals:
+class Residuals(Stamped):
     """Store the outcome of each TDOA.
 
     Attributes
@@ -97,12 +98,9 @@ class Residuals:
         unknown = np.full(n, math.nan)
         return cls(t, a, b, unknown, unknown, np.zeros(n), np.full(n, verdict, np.uint8))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
 
 @dataclass(frozen=True)
-class Odometry:
+class Odometry(Stamped):
     """Store estimates of the filter.
 
     Attributes
@@ -159,9 +157,6 @@ class Odometry:
             rows["rate"],
             rows["rate_variance"],
         )
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 # a dataclass of arrays of equal length: Odometry, Residuals, a stream of a Flight

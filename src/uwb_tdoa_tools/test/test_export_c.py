@@ -15,7 +15,7 @@ import pytest
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.model import load_network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.exporting.c_code import NO_PAIR, NOT_FINITE, vehicle_code, write_c
+from uwb_tdoa_tools.exporting.c_code import vehicle_code, write_c
 from uwb_tdoa_tools.exporting.onnx_file import write_onnx
 from uwb_tdoa_tools.exporting.tracing import trace
 
@@ -25,6 +25,7 @@ needs_board = pytest.mark.skipif(
 )
 SANITIZED = (*c.STRICT, "-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 KINDS = tuple(c.effects())
+NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
 
 
 def same_bits(results, code, some):

@@ -14,10 +14,11 @@ Every parameter is documented in config/vehicle_node.yaml.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 import json
 import sys
 import time
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from builtin_interfaces.msg import Duration as DurationMessage
 from rclpy.duration import Duration
@@ -72,6 +73,30 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     ),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
 }
+COMMANDS: dict[str, tuple[type, Callable[..., None], Callable[[Any], tuple[Any, ...]]]] = {
+    # {service: (type, method of Pilot, its values in a request)}
+    "takeoff": (
+        Takeoff,
+        Pilot.take_off,
+        lambda of: (of.group_mask, of.height, _seconds(of.duration)),
+    ),
+    "go_to": (
+        GoTo,
+        Pilot.go_to,
+        lambda of: (
+            of.group_mask,
+            of.relative,
+            (of.goal.x, of.goal.y, of.goal.z),
+            of.yaw,
+            _seconds(of.duration),
+        ),
+    ),
+    "land": (
+        Land,
+        Pilot.land,
+        lambda of: (of.group_mask, of.height, _seconds(of.duration)),
+    ),
+}
 SETTLE = 1.0  # s from the first subscription until the other nodes have discovered each other
 
 
@@ -108,9 +133,8 @@ class VehicleNode(StreamNode):
             ()
             if self._mission
             else [
-                self.create_service(Takeoff, "takeoff", self._on_takeoff),
-                self.create_service(GoTo, "go_to", self._on_go_to),
-                self.create_service(Land, "land", self._on_land),
+                self.create_service(kind, name, partial(self._answer, name))
+                for name, (kind, *_) in COMMANDS.items()
             ]
         )
         self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
@@ -151,39 +175,15 @@ class VehicleNode(StreamNode):
             self._verdict.wait_for_all_acked(Duration(seconds=SETTLE))
             raise SystemExit(int(not reached(verdict)))
 
-    def _answer(
-        self, response: Response, command: Callable[..., None], *values: object
-    ) -> Response:
-        """Execute a request, or state why not in the response."""
+    def _answer(self, name: str, request: Any, response: Response) -> Response:
+        """Execute a request for one of COMMANDS, or state why not in the response."""
+        _, command, values = COMMANDS[name]
         try:
-            command(*values)
+            command(self._pilot, *values(request))
             response.success = True
         except InputError as error:
             response.message = str(error)
         return response
-
-    def _on_takeoff(self, request: Takeoff.Request, response: Takeoff.Response) -> Takeoff.Response:
-        return self._answer(
-            response,
-            self._pilot.take_off,
-            request.group_mask,
-            request.height,
-            _seconds(request.duration),
-        )
-
-    def _on_go_to(self, request: GoTo.Request, response: GoTo.Response) -> GoTo.Response:
-        goal = request.goal.x, request.goal.y, request.goal.z
-        values = request.group_mask, request.relative, goal, request.yaw, _seconds(request.duration)
-        return self._answer(response, self._pilot.go_to, *values)
-
-    def _on_land(self, request: Land.Request, response: Land.Response) -> Land.Response:
-        return self._answer(
-            response,
-            self._pilot.land,
-            request.group_mask,
-            request.height,
-            _seconds(request.duration),
-        )
 
 
 def _seconds(duration: DurationMessage) -> float:

@@ -5,7 +5,7 @@
 An effect states its equation once, for arrays of numbers. `export` calls the same code with
 symbolic arrays, and records the equation. numpy's functions take both kinds by themselves. The
 functions below do so where numpy's do not: for conversions, compiled functions, and functions that
-are polynomials between given places.
+are polynomials between given places. All tables of measurements are Stamped.
 """
 
 from __future__ import annotations
@@ -15,6 +15,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+
+class Stamped:
+    """Arrays of one length with stamps t (n,), s."""
+
+    t: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.t)
 
 
 class SymbolicArray(ABC):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from .anchors import Anchors
+from .arrays import Stamped
 from .errors import sanitize
 from .sensors import LOCATING, SENSORS
 
@@ -18,7 +19,7 @@ STREAMS = "tdoa", "imu", "truth", *SENSOR_NAMES  # of a Flight, each on its own 
 
 
 @dataclass(frozen=True)
-class Imu:
+class Imu(Stamped):
     """Inertial samples in the body frame (x forward, y left, z up: REP-103).
 
     Attributes
@@ -32,12 +33,9 @@ class Imu:
     gyro: np.ndarray
     accel: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.t)
-
 
 @dataclass(frozen=True)
-class Tdoas:
+class Tdoas(Stamped):
     """Raw TDOA measurements.
 
     Attributes
@@ -58,12 +56,9 @@ class Tdoas:
         if self.variance is None:
             object.__setattr__(self, "variance", np.zeros(len(self.t)))
 
-    def __len__(self) -> int:
-        return len(self.t)
-
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Stamped):
     """Ground truth.
 
     Attributes
@@ -76,9 +71,6 @@ class Truth:
     t: np.ndarray
     p: np.ndarray
     q: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 _SensorStreams: Any = make_dataclass(  # attribute names: SENSORS

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 
 from ..common.anchors import Anchors
-from ..common.arrays import filled, floats
+from ..common.arrays import Stamped, filled, floats
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.flight import Flight
@@ -108,7 +108,7 @@ def _differences(
 
 
 @dataclass(frozen=True)
-class Samples:
+class Samples(Stamped):
     """A batch of n TDOAs and the true, or estimated, poses of the tag.
 
     t : (n,) s
@@ -142,9 +142,6 @@ class Samples:
 
     channel: ClassVar[str] = "tdoa"
     ends: ClassVar[int] = 2  # anchors of one measurement
-
-    def __len__(self) -> int:
-        return len(self.t)
 
     @cached_property
     def _kept(self) -> dict[Hashable, Any]:
@@ -277,7 +274,7 @@ def _repeated(value: Any, times: int) -> Any:
 
 
 @dataclass(frozen=True)
-class ImuSamples:
+class ImuSamples(Stamped):
     """Means of an inertial sensor over n short cells.
 
     channel : "gyro" or "accel"
@@ -301,12 +298,9 @@ class ImuSamples:
     motion: Motion
     extra: dict[str, np.ndarray] | None = None
 
-    def __len__(self) -> int:
-        return len(self.t)
-
 
 @dataclass(frozen=True)
-class SensorSamples:
+class SensorSamples(Stamped):
     """A batch of n measurements of an auxiliary sensor.
 
     channel : name of the stream, or of one of its parts
@@ -327,9 +321,6 @@ class SensorSamples:
     up: np.ndarray
     motion: Motion
     vibration: np.ndarray | None = None
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 class PoseColumns(Protocol):

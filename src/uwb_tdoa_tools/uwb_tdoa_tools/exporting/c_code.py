@@ -374,7 +374,6 @@ MEMBERS = {  # of the state, by the names of inputs
 }
 RATES = {"ax", "ay", "az", "wx", "wy", "wz"}  # inputs of acceleration and rate
 NOT_ESTIMATED = "the filter of the firmware estimates no acceleration and no rate"
-NO_PAIR, NOT_FINITE = 1, 2  # results of the functions in C
 
 HEADER = """\
 /* Systematic errors of UWB TDOAs, written by uwb_tdoa_tools {version}.

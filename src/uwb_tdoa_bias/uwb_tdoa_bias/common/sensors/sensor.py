@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import Stamped
 from ..errors import InputError
 
 PAGE = "docs/add_sensor.md"
@@ -30,16 +31,13 @@ LARGEST_NUMBER = 1e30
 
 
 @dataclass(frozen=True)
-class Stream:
+class Stream(Stamped):
     """Measurements of one sensor: a frozen dataclass of arrays of one length.
 
     The first array is t (n,), s.
     """
 
     t: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.t)
 
     @property
     def columns(self) -> list:
