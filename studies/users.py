@@ -57,30 +57,52 @@ BODIES = {
     "racing": Body((3.5, 3.5, 0.5), 8.0, tilts=True),
     "lift": Body((0.3, 0.3, 1.0), 0.5),
 }
-# errors of anchors; and anchors on one line that is no axis, rates beyond the range of the gyroscope,
-# a height that is not fixed
+# errors of anchors; and anchors on one line that is no axis, anchors of the ceiling alone, rates beyond
+# the range of the gyroscope, a height that is not fixed
 ERRORS = "white", "delays", "survey", "reflections"
-LINE, CLIPPED, FIXED = "oblique line", "clipped gyroscope", "fixed height"
+LINE, CEILING, CLIPPED, FIXED = "oblique line", "ceiling", "clipped gyroscope", "fixed height"
 SHARE = 0.023  # of the samples of a gyroscope, beyond its range
 CELLS = [  # body, IMU (Hz), TDOAs/s, errors
+    ("rest", 0, 1, "white"),
+    ("rest", 0, 2, "white"),
     ("rest", 0, 10, "white"),
     ("rest", 0, 10, "delays"),
+    ("rest", 0, 50, "reflections"),
     ("rest", 0, 200, "white"),
+    ("rest", 100, 10, "survey"),
     ("rest", 100, 50, "delays"),
+    ("rest", 500, 400, "delays"),
+    ("person", 0, 1, "white"),
     ("person", 0, 2, "white"),
+    ("person", 0, 5, "reflections"),
     ("person", 0, 10, "delays"),
+    ("person", 0, 50, "survey"),
+    ("person", 0, 200, "reflections"),
+    ("person", 100, 10, "white"),
     ("person", 100, 50, "reflections"),
     ("runner", 0, 5, "white"),
+    ("runner", 0, 10, "delays"),
     ("runner", 0, 20, "white"),
     ("runner", 0, 20, "reflections"),
+    ("runner", 100, 20, "survey"),
+    ("rover", 0, 5, "white"),
+    ("rover", 0, 20, "reflections"),
+    ("rover", 0, 200, "delays"),
+    ("rover", 100, 5, "delays"),
     ("rover", 100, 20, "survey"),
     ("rover", 100, 200, "white"),
     ("quadrotor", 500, 5, "white"),
+    ("quadrotor", 500, 20, "delays"),
     ("quadrotor", 500, 50, "white"),
+    ("quadrotor", 100, 200, "survey"),
     ("quadrotor", 500, 400, "reflections"),
     ("quadrotor", 500, 1000, "survey"),
+    ("racing", 500, 50, "white"),
     ("racing", 500, 200, "white"),
+    ("racing", 500, 400, "delays"),
     ("racing", 0, 200, "white"),
+    ("person", 0, 10, CEILING),
+    ("quadrotor", 500, 200, CEILING),
     ("quadrotor", 500, 50, LINE),
     ("racing", 500, 200, CLIPPED),
     ("lift", 100, 50, FIXED),
@@ -113,6 +135,8 @@ def simulate(
     left /= np.linalg.norm(left, axis=1)[:, None]
     q = Rotation.from_matrix(np.stack([np.cross(left, up), left, up], axis=2))
     places = np.array([(x, y, z) for z in (0.2, 2.8) for x in (-4.0, 4.0) for y in (-4.0, 4.0)])
+    if errors == CEILING:  # below it, the others half way between the corners
+        places[:4] = [(4.0, 0.0, 2.6), (0.0, 4.0, 2.6), (-4.0, 0.0, 2.6), (0.0, -4.0, 2.6)]
     if errors == LINE:
         places = np.linspace((-4.0, -2.4, 2.8), (4.0, 2.4, 2.8), 8)
     surveyed = places + SURVEY * (errors == "survey") * rng.normal(size=(8, 3))
