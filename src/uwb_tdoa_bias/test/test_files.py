@@ -28,6 +28,7 @@ from uwb_tdoa_bias.common.files import (
     read_head,
     write_bytes,
     write_filled,
+    write_picture,
     write_text,
 )
 from uwb_tdoa_bias.common.flight import Flight
@@ -491,3 +492,13 @@ def test_a_terminal_shows_what_would_steer_it():
 def test_a_name_means_nothing_anywhere(name, left):
     assert sanitize(name) == left and sanitize(left) == left
     assert Flight(name, None, None).name == left
+
+
+@pytest.mark.parametrize(
+    ("name", "begins"),
+    [("a.png", b"\x89PNG"), ("a.PDF", b"%PDF"), ("a.svg", b"<?xml"), ("a", b"\x89PNG")],
+)
+def test_a_picture_has_the_format_of_its_name(tmp_path, name, begins):
+    figure = pytest.importorskip("matplotlib.figure").Figure()
+    write_picture(tmp_path / name, figure)
+    assert (tmp_path / name).read_bytes().startswith(begins)

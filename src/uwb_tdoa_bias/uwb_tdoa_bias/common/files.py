@@ -83,8 +83,13 @@ def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
 
 
 def write_picture(path: str | Path, figure: Any, dpi: int = 110) -> None:
-    """Write a Figure of matplotlib as an image; otherwise as `write_bytes`."""
-    write_filled(path, lambda file: figure.savefig(file, dpi=dpi))
+    """Write a Figure of matplotlib in the format that the path ends with; otherwise as `write_bytes`.
+
+    Other paths, such as /dev/stdout, get a PNG.
+    """
+    suffix = Path(path).suffix[1:].lower()
+    kind = suffix if suffix in figure.canvas.get_supported_filetypes() else "png"
+    write_filled(path, lambda file: figure.savefig(file, dpi=dpi, format=kind))
 
 
 def write_bytes(path: str | Path, content: bytes) -> None:

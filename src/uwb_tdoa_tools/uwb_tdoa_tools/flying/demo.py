@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.model import load_network
@@ -166,7 +166,7 @@ def draw(
         ax.legend(title="pair of anchors", ncols=4, loc="lower center", handlelength=1.0)
         _path(axes[1, 0], flight, scores)
         _error(axes[1, 1], scores)
-        write_filled(path, partial(figure.savefig, dpi=100))
+        write_picture(path, figure, 100)
 
 
 def _path(ax: Axes, flight: Flight, scores: Sequence[Score]) -> None:

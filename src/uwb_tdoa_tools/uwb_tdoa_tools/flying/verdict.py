@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 import math
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.files import write_picture
 from uwb_tdoa_ekf.results import Odometry, rows_of
 
 from ..bags.bag import write_bag
@@ -494,7 +493,7 @@ def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> 
         axes.set(ylabel=f"{axis}, m")
     axes.set(xlabel="t, s")
     axes.legend()
-    write_filled(path, partial(figure.savefig, dpi=120))
+    write_picture(path, figure, 120)
 
 
 def fly_task(
