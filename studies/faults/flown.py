@@ -179,8 +179,7 @@ class FaultyFilter:
         )
 
     def _look(self) -> None:
-        estimator, newest = self._ours.estimator, self._ours.newest
-        self._looked = self._now
+        estimator, newest, self._looked = self._ours.estimator, self._ours.newest, self._now
         self._use.update(self._now, self._received, estimator.counts, estimator.running)
         if self._now >= self._reported + REPORT:
             self._reported = self._now
@@ -207,10 +206,14 @@ class FaultyFilter:
         return self._ours.pose
 
     @property
+    def yaw_known(self) -> bool:
+        """As of OwnFilter."""
+        return self._ours.yaw_known
+
+    @property
     def deviation(self) -> float:
         """m, inf where `status` is not "running", and where the odometry is old by its stamp."""
-        newest = self._ours.newest
-        old = newest is not None and self._now - newest.t[-1] > OLDEST
+        old = self.pose is not None and self._now - self.pose[0] > OLDEST
         return math.inf if self.why or old else self._ours.deviation
 
     @property
@@ -254,5 +257,5 @@ def line(name: str, rows: list[dict[str, Any]]) -> str:
     those that came down safely.
     """
     said = next((row["said"] for row in rows if row["said"]), "nothing")
-    counts = [len(rows), *(sum(row[key] for row in rows) for key in ("landed", "safe"))]
-    return table.line([name, said[:90], *counts])
+    counts = (sum(row[key] for row in rows) for key in ("landed", "safe"))
+    return table.line([name, said[:90], len(rows), *counts])

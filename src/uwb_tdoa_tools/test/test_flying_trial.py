@@ -3,6 +3,7 @@
 """A flight of `fly`: its sensor data and its course."""
 
 from dataclasses import replace
+import math
 
 import known_answer
 import numpy as np
@@ -13,11 +14,16 @@ from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.pressure import SITE
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.mission import DONE, HEIGHT, RISE, Circles, Rules
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_tools.flying.controller import integrate
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, HEIGHT, LOST, RISE, Circles, Rules
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
-from uwb_tdoa_tools.flying.trial import Task, fly
+from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial, fly
 from uwb_tdoa_tools.flying.vehicle import (
+    ATTITUDE,
     HALL,
+    POSITION,
+    VELOCITY,
     WORLDS,
     AuxiliarySensor,
     InertialErrors,
@@ -235,6 +241,64 @@ def test_through_a_silence_and_by_late_samples_it_flies_on():
     assert heard[gap : gap + 2] == pytest.approx([began, began + 3.0], abs=0.02)
     assert flown.flight.truth.t[-1] - flown.odometry.t[-1] >= 0.05 - 1e-9
     assert verdict_of(flown)["safe"]
+
+
+def test_inertial_samples_propagate_position_velocity_and_attitude(plain):
+    flight, states = plain.flight, plain.states
+    begin, end = np.searchsorted(flight.truth.t, (9.0, 11.0))  # on the circle
+    p, v, q = (states[begin, of].copy() for of in (POSITION, VELOCITY, ATTITUDE))
+    rows = slice(*np.searchsorted(flight.imu.t, (flight.truth.t[begin] + 1e-6, 11.0 - 1e-6)))
+    samples = np.hstack([flight.imu.gyro, flight.imu.accel])[rows]
+    integrate(flight.truth.t[begin], p, v, q, flight.imu.t[rows], samples)
+    np.testing.assert_allclose(p, states[end - 1, POSITION], atol=0.2)
+    np.testing.assert_allclose(v, states[end - 1, VELOCITY], atol=0.15)
+    assert abs(q @ states[end - 1, ATTITUDE]) > math.cos(math.radians(0.5))
+
+
+class Wrong(OwnFilter):
+    """An estimate that is certain, and wrong from 12 s on."""
+
+    speed, turn, unsure, yaw_known = 0.0, 0.0, False, True
+
+    @property
+    def pose(self):
+        pose = super().pose
+        if pose is None or pose[0] < 12.0:
+            return pose
+        t, p, v, q = pose
+        turned = Rotation.from_euler("z", self.turn * (t - 12.0)) * Rotation.from_quat(q)
+        return t, p, v + [0.0, self.speed, 0.0], turned.as_quat()
+
+    @property
+    def deviation(self):
+        return 2.0 if self.unsure else super().deviation
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(1.5, 0.0), (0.0, 0.5)], ids=["velocity", "yaw"])
+def test_an_estimate_that_the_imu_contradicts_is_not_flown_by(speed, turn):
+    source = Wrong(PERFECT.anchors, FilterConfig())
+    source.speed, source.turn = speed, turn
+    trial = Trial(Task(PERFECT, 3, "place", path=SHORT), source)
+    trial.fly()
+    verdict = verdict_of(trial.result)
+    assert verdict["safe"] and 12.0 < verdict["reported_lost"] < 13.5
+
+
+def test_without_a_yaw_a_lost_vehicle_does_not_go_on():
+    source = Wrong(PERFECT.anchors, FilterConfig())
+    trial = Trial(Task(PERFECT, 3, "place", path=SHORT), source)
+    trial.begin()
+    states = []
+    for end, source.unsure, source.yaw_known in (
+        (10.0, False, True),
+        (10.1, True, True),
+        (10.3, False, False),
+        (10.4, False, True),
+    ):
+        while trial.simulator.now < end:
+            trial.turn()
+        states.append(trial.missions[0].state)
+    assert states == [FLYING, LOST, LOST, FLYING]
 
 
 def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):

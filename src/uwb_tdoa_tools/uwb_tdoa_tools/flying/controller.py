@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.geometry import rotate
 
 from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Record, Vehicle
 
@@ -124,23 +125,15 @@ def outer(
         Integral part (3,) m/s^2 and body rates (3,) rad/s. Both are written.
     """
     p, v, q = estimate[0], estimate[1], estimate[2]
-    a, error = np.empty(3), np.empty(3)
-    far = 0.0
-    for k in range(3):
-        off = wanted[0, k] - p[k]
-        error[k] = 0.0 if math.isnan(off) else off
-        far += error[k] ** 2
-    shorter = POSITION_GAIN * min(1.0, REACH / max(math.sqrt(far), 1e-9))
-    for k in range(3):
-        slow = wanted[1, k] + shorter * error[k] - v[k]
-        grown = integral[k] + INTEGRAL_GAIN * min(max(slow, -0.5), 0.5) * dt
-        integral[k] = min(max(grown, -MOST_INTEGRAL), MOST_INTEGRAL)
-        a[k] = wanted[2, k] + VELOCITY_GAIN * slow + integral[k]
+    error = np.where(np.isnan(wanted[0]), 0.0, wanted[0] - p)
+    far = math.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
+    slow = wanted[1] + POSITION_GAIN * min(1.0, REACH / max(far, 1e-9)) * error - v
+    grown = integral + INTEGRAL_GAIN * np.clip(slow, -0.5, 0.5) * dt
+    integral[:] = np.clip(grown, -MOST_INTEGRAL, MOST_INTEGRAL)
+    a = wanted[2] + VELOCITY_GAIN * slow + integral
     a[2] = max(a[2] + GRAVITY, LEAST_THRUST * GRAVITY)
     level, most = math.hypot(a[0], a[1]), math.tan(MOST_TILT) * a[2]
-    if level > most:
-        a[0] *= most / level
-        a[1] *= most / level
+    a[:2] *= most / max(level, most)
     size = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
     zx, zy, zz = a[0] / size, a[1] / size, a[2] / size
     # wanted axes: z along the thrust, x toward the yaw
@@ -160,8 +153,7 @@ def outer(
     rates[0] = -ATTITUDE_GAIN * 0.5 * (zy_ - yz_)
     rates[1] = -ATTITUDE_GAIN * 0.5 * (xz_ - zx_)
     rates[2] = -YAW_GAIN * 0.5 * (yx_ - xy_)
-    for k in range(3):
-        rates[k] = min(max(rates[k], -MOST_RATE), MOST_RATE)
+    rates[:] = np.clip(rates, -MOST_RATE, MOST_RATE)
     along = a[0] * r02 + a[1] * r12 + a[2] * r22
     return weight / GRAVITY * min(max(along, LEAST_THRUST * GRAVITY), MOST_THRUST * GRAVITY)
 
@@ -213,6 +205,37 @@ def inner(
         of_yaw = min(max(of_yaw, -YAW_SHARE * full), YAW_SHARE * full)
         force = 0.25 * thrust + of_tilt + of_yaw
         speeds[k] = math.sqrt(min(max(force, LEAST_SHARE * full), full) / vehicle.thrust)
+
+
+@compiled
+def integrate(
+    since: float,
+    p: np.ndarray,
+    v: np.ndarray,
+    q: np.ndarray,
+    times: np.ndarray,
+    samples: np.ndarray,
+) -> None:
+    """Propagate position, velocity and attitude by inertial samples, in place.
+
+    Parameters
+    ----------
+    since : float
+        Stamp of the three, s.
+    p, v, q : numpy.ndarray
+        Position (3,), m, and velocity (3,), m/s, world frame, and attitude (4,) x y z w.
+    times, samples : numpy.ndarray
+        Later stamps (n,), s. Body rates, rad/s, and specific forces, m/s^2 (n, 6).
+    """
+    force = np.empty(3)
+    for j in range(len(times)):
+        dt, since = times[j] - since, times[j]
+        rotate_attitude(q, samples[j, :3], dt)
+        rotate(q, samples[j, 3:], force)
+        force[2] -= GRAVITY
+        for k in range(3):
+            v[k] += force[k] * dt
+            p[k] += v[k] * dt
 
 
 @compiled

@@ -189,9 +189,12 @@ def _error(ax: Axes, scores: Sequence[Score]) -> None:
         ax.plot(score.t - score.first, size, color=colour, lw=1.5, label=score.name)
     sizes = [f"{CM * score.row()['rmse_3d']:.1f}" for score in scores]
     highest = CM * max(np.linalg.norm(score.error, axis=1).max() for score in scores)
-    ax.set(xlabel="time in the air [s]", ylabel="3D position error [cm]")
-    ax.set_ylim(0.0, ROOM * highest)
-    ax.set_title(f"Position: {listed(sizes)} cm off")
+    ax.set(
+        xlabel="time in the air [s]",
+        ylabel="3D position error [cm]",
+        ylim=(0.0, ROOM * highest),
+        title=f"Position: {listed(sizes)} cm off",
+    )
     ax.legend(loc="upper right", ncols=2)
     ax.grid(alpha=0.3)
 
@@ -212,13 +215,8 @@ def corrector_of(
     InputError
         If a file cannot be used.
     """
-    if not (effects or model):
-        return None
-    return Corrector(
-        flight.anchors,
-        EffectSet.from_yaml(effects) if effects else EffectSet(),
-        load_network(model),
-    )
+    known = EffectSet.from_yaml(effects) if effects else EffectSet()
+    return Corrector(flight.anchors, known, load_network(model)) if effects or model else None
 
 
 def correction_in_words(corrector: Corrector | None, *files: str | Path | None) -> str:
@@ -484,7 +482,12 @@ def fly_both(
         title = f"{name} {CORRECTION}"
         files = {"model_file": file}
         live = through_nodes(
-            flight, bag, bag.parent / name, rate, files, partial(_titled, say, title)
+            flight,
+            bag,
+            bag.parent / name,
+            rate,
+            files,
+            lambda text: say(f"{title}: {text}"),
         )
         passes.append(live)
         if live.missing:
@@ -560,11 +563,6 @@ def close_loop(
     show("really", [truth_in_words(seed, result.flight)])
     show("took", [times_in_words(laps)])
     return result, result.figures(seed, diagnosis, laps)
-
-
-def _titled(say: Callable[[str], object], title: str, text: str) -> None:
-    """Say a line of progress of one pass."""
-    say(f"{title}: {text}")
 
 
 def too_slow_in_words(missing: int, rate: float) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.interpolate import make_interp_spline
@@ -229,7 +229,7 @@ class Rules:
     arm: float = 1.0
     lost: float = 1.5
     stale: float = 0.6
-    descent_speed: float = 0.25
+    descent_speed: float = 0.4
     ground_support: float = 0.09
     near_end: float = 1.5
     longest_descent: float = 10.0
@@ -319,6 +319,9 @@ class Journey:
 DESCENT_LEAD = 0.15
 # s, averaging time of the support in the air, where an offset of the accelerometer is all of it
 SUPPORT_OFFSET_TIME = 2.0
+CONTACT_TIME = (
+    0.15  # s of support that mean ground contact to a lost vehicle: it brakes hard at first
+)
 
 
 class Mission(Journey):
@@ -358,6 +361,7 @@ class Mission(Journey):
         self._last = 0.0  # s, of the step before
         self._descent_began = 0.0  # s
         self._support_offset = 0.0  # support, of the weight
+        self._unsupported = 0.0  # s, last time without support by the ground
         self._descent: tuple[float, float] | None = None  # (s, m) at the start of the final descent
 
     def decide(
@@ -396,7 +400,9 @@ class Mission(Journey):
                 support - self._support_offset
             )
         self._last = t
-        on_ground = support - self._support_offset > self.rules.ground_support
+        if support - self._support_offset <= self.rules.ground_support:
+            self._unsupported = t
+        on_ground = t - self._unsupported > (CONTACT_TIME if lost else 0.0)
         too_long = t - self._descent_began > self.rules.longest_descent
         if not on_the_way and (on_ground or too_long):
             self._end(t)
@@ -434,7 +440,7 @@ class Mission(Journey):
         return self._path.at(self._along(t))
 
 
-def yaw_of(q: np.ndarray) -> float:
-    """Return the yaw, rad, of an attitude (4,) x y z w."""
-    x, y, z, w = q
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+def yaw_of(q: np.ndarray) -> Any:
+    """Return the yaw, rad, of an attitude (4,) x y z w, or the yaws (n,) of attitudes (n, 4)."""
+    x, y, z, w = q.T
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

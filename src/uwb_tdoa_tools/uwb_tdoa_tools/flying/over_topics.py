@@ -280,6 +280,10 @@ class OverTopics(EstimateSource):
         return super().deviation if is_running else math.inf
 
     @property
+    def yaw_known(self) -> bool:
+        return self.status is not None and bool(self.status.yaw_known)
+
+    @property
     def why(self) -> str:
         """Return the reason for which the estimate cannot be used, or ""."""
         if self.status is None:

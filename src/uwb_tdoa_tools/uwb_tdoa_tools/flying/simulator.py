@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -98,36 +97,6 @@ def interval(
         gyro[0] = samples[i, :3]
         truth[i] = state
         contact[i] = feet
-
-
-@compiled
-def poses_at(
-    t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray
-) -> None:
-    """Interpolate poses between true states.
-
-    Parameters
-    ----------
-    t : numpy.ndarray
-        Stamps (n,), s.
-    times, states : numpy.ndarray
-        Stamps (m,), s, and states (m, 17).
-    p, q : numpy.ndarray
-        Positions (n, 3), m, and attitudes (n, 4), x y z w. They are written.
-    """
-    j = 0
-    for i in range(len(t)):
-        while j < len(times) - 2 and times[j + 1] < t[i]:
-            j += 1
-        share = (t[i] - times[j]) / (times[j + 1] - times[j])
-        for k in range(3):
-            p[i, k] = states[j, k] + share * (states[j + 1, k] - states[j, k])
-        length = 0.0
-        for k in range(4):
-            q[i, k] = states[j, 6 + k] + share * (states[j + 1, 6 + k] - states[j, 6 + k])
-            length += q[i, k] ** 2
-        for k in range(4):
-            q[i, k] /= math.sqrt(length)
 
 
 TICK = 4  # inertial samples per turn of the controller
@@ -309,10 +278,10 @@ class Simulator:
         """
         first = self._heard[stream]
         new = slice(first, int(np.searchsorted(t, self.now, side="right")))
-        p, q = np.empty((new.stop - first, 3)), np.empty((new.stop - first, 4))
-        poses_at(t[new], self.times[lately], self.states[lately], p, q)
+        at = np.array([np.interp(t[new], self.times[lately], of) for of in self.states[lately].T]).T
+        q = at[:, ATTITUDE] / np.linalg.norm(at[:, ATTITUDE], axis=1, keepdims=True)
         self._heard[stream] = new.stop
-        return new, p, q
+        return new, at[:, POSITION].copy(), q
 
     def _with_effects(self, streams: Streams) -> Streams:
         """Return the samples with the effects of the world added by `Effect.inject`."""

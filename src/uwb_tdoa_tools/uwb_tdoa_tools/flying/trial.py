@@ -7,6 +7,7 @@ The same task gives the same flight on any computer.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field, replace
 import math
 from typing import Any
@@ -19,13 +20,14 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.model import Model, load_network
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
+from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of, rotation_std
 
-from .controller import SUPPORT_TIME, Controller, rotate_attitude
-from .mission import DONE, REFUSED, Circles, Mission, Pose, Rules, TimedPath, Waypoints
+from .controller import SUPPORT_TIME, Controller, integrate
+from .mission import DONE, LOST, REFUSED, Circles, Mission, Pose, Rules, TimedPath, Waypoints
 from .simulator import DT, Simulator, Streams, Transport
-from .vehicle import ATTITUDE, IMU_RATE, POSITION, World, random
+from .vehicle import ATTITUDE, GRAVITY, IMU_RATE, POSITION, World, random
 
 _NO_VECTORS = np.empty((0, 3))
 NO_ODOMETRY = Odometry(
@@ -71,6 +73,11 @@ class EstimateSource:
     def why(self) -> str:
         """Return the reason for which the estimate cannot be used, or ""."""
         return ""
+
+    @property
+    def yaw_known(self) -> bool:
+        """Return whether the yaw of the estimate can be used."""
+        return True
 
     @property
     def pose(self) -> Pose | None:
@@ -154,6 +161,13 @@ class OwnFilter(EstimateSource):
         if not self._corrector.idle:
             self._corrector.add_pose(*poses_of(odometry))
 
+    @property
+    def yaw_known(self) -> bool:
+        newest = self.newest
+        return newest is not None and bool(
+            rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2] <= YAW_KNOWN
+        )
+
     def _add(self, name: str, part: Any) -> None:
         """Give a part of one stream to the filter, and correct the bias of TDOAs."""
         if name == "imu":
@@ -187,6 +201,26 @@ OUTSIDE = 0.5  # m beyond the walls, end of a flight
 TIPPED = math.radians(75.0)  # tilt on the ground from which it cannot recover
 # s after switching on, and standard deviation, m and rad, of the given place and yaw
 GIVEN_AT, GIVEN_STD = 0.3, 0.1
+
+
+# the check of the estimate by the vehicle's own IMU: s, age of the estimate that it starts from;
+# s at rest that determine the offsets of the IMU; s on the path during which the floor disturbs the
+# estimate; s after the vehicle was lost until an estimate can be a start
+MEMORY, AT_REST, LIFT_OFF, SETTLED = 2.0, 1.0, 4.0, 1.0
+# difference that contradicts, for each second of the age: position in stated deviations, m/s, rad.
+# 60 flights without a fault reach 2.1, 0.31 and 0.03.
+FARTHER, FASTER, TURNED = 2.5, 0.4, 0.13
+
+
+def _differ(one: Pose, other: Pose, deviation: float, age: float) -> bool:
+    """Return whether two poses differ by more than `age`, s, of inertial samples explain.
+
+    deviation : float
+        Stated standard deviation of a coordinate, m.
+    """
+    far, fast = (float(np.linalg.norm(one[k] - other[k])) for k in (1, 2))
+    turn = 2.0 * math.acos(min(1.0, abs(float(one[3] @ other[3]))))
+    return max(far / (FARTHER * deviation), fast / FASTER, turn / TURNED) > max(age, MEMORY)
 
 
 @dataclass(frozen=True)
@@ -303,11 +337,13 @@ class Trial:
         self.missions: list[Any] = []
         self.crash = ""
         self._arrived: list[Streams] = []
+        # poses of the last MEMORY s that could be flown by, each with its deviation, m
+        self._past: deque[tuple[Pose, float]] = deque(maxlen=int(MEMORY / DT))
+        self._stop()
 
     def _longest(self) -> float:
         """Return the longest duration of the task, s."""
-        rules = self.task.rules
-        path = self.task.path.duration
+        rules, path = self.task.rules, self.task.path.duration
         once = rules.rest + rules.patience + path + rules.longest_descent + REST_AFTER
         return 2.0 * once + (PAUSE + CARRY_TIME) if self.task.again else once
 
@@ -344,11 +380,8 @@ class Trial:
     def over(self) -> bool:
         """Return whether the active mission has ended."""
         mission = self.missions[-1]
-        rested = (
-            mission.state == DONE
-            and mission.ended is not None
-            and self.simulator.now > mission.ended + REST_AFTER
-        )
+        ended = mission.ended if mission.state == DONE else None
+        rested = ended is not None and self.simulator.now > ended + REST_AFTER
         return bool(rested or mission.state == REFUSED or self.crash or self.simulator.over)
 
     def turn(self) -> None:
@@ -357,22 +390,57 @@ class Trial:
             self._schedule_faults(self.missions[-1])
             self._control(self.missions[-1])
         else:
-            self.controller.stop()
+            self._stop()
         self._turn()
 
     def _control(self, mission: Any) -> None:
         """Set the outputs of the controller as a mission wants."""
-        now, k, pose = self.simulator.now, self.simulator.done, self.source.pose
-        lately = slice(max(k - int(SUPPORT_TIME * IMU_RATE), 0), k + 1)
-        support = self.controller.support(float(np.mean(self.simulator.samples[lately, 5])))
-        wanted = mission.decide(now, pose, self.source.deviation, support)
+        now, source = self.simulator.now, self.source
+        support = self.controller.support(float(np.mean(self._samples(SUPPORT_TIME)[:, 5])))
+        pose = None if source.pose is None else self._propagated(source.pose)
+        own = self._own_pose(mission, pose)
+        refused = self._contradicted or (mission.state == LOST and own and not source.yaw_known)
+        deviation = math.inf if refused else source.deviation
+        wanted = mission.decide(now, pose, deviation, support)
         if wanted is None:
-            self.controller.stop()
+            self._stop()
             return
-        assert pose is not None  # a mission starts with a pose
-        since, p, v, q = pose
-        attitude = self._predicted_attitude(q, since)
-        self.controller.fly(p, v, attitude, wanted, mission.yaw, DT)
+        assert source.pose is not None and pose is not None  # a mission starts with a pose
+        if mission.state == LOST:
+            pose, self._last_lost = own or pose, now
+        elif source.yaw_known and now > self._last_lost + SETTLED:
+            self._past.append((source.pose, source.deviation))
+        self.controller.fly(*pose[1:], wanted, mission.yaw, DT)
+
+    def _stop(self) -> None:
+        """Turn the rotors off, forget the flight, and determine the offsets of the IMU at rest."""
+        self.controller.stop()
+        self._past.clear()
+        self._own_usable, self._contradicted, self._last_lost = True, False, -math.inf
+        resting = np.median(self._samples(AT_REST), axis=0)
+        self._offsets = resting - [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY]
+
+    def _samples(self, seconds: float) -> np.ndarray:
+        """Return the inertial samples (n, 6) of the last seconds."""
+        end = self.simulator.done + 1
+        return self.simulator.samples[max(end - 1 - int(seconds * IMU_RATE), 0) : end]
+
+    def _own_pose(self, mission: Mission, pose: Pose | None) -> Pose | None:
+        """Return an estimate of before, propagated by the IMU, and compare the newest `pose` with it.
+
+        After lift-off a contradiction means that the estimate is wrong. During lift-off it means that the
+        IMU is not precise enough, for example because the rotors shake it.
+        """
+        if pose is None or not self._past or not self._own_usable:
+            return None
+        before, deviation = self._past[0]
+        own = self._propagated(before)
+        differ = _differ(pose, own, deviation, self.simulator.now - before[0])
+        if mission.path_time < LIFT_OFF:
+            self._own_usable = not differ
+        else:
+            self._contradicted |= differ
+        return own
 
     def _schedule_faults(self, mission: Any) -> None:
         """Set the times of the gap and of the anchor change for a mission."""
@@ -383,9 +451,9 @@ class Trial:
 
     def rest(self, seconds: float) -> None:
         """Wait with the rotors off."""
-        self.controller.stop()
         end = self.simulator.now + seconds
         while self.simulator.now < end and not (self.simulator.over or self.crash):
+            self._stop()
             self._turn()
 
     def _turn(self) -> None:
@@ -407,14 +475,13 @@ class Trial:
             return "flew into a wall"
         return "flew into the ceiling" if z > size[2] + OUTSIDE else ""
 
-    def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
-        """Return the present attitude (4,): that of the time `since`, s, rotated by the gyroscope."""
-        k = self.simulator.done
-        times, samples = self.simulator.times[: k + 1], self.simulator.samples
-        attitude = attitude.copy()
-        for j in range(max(int(np.searchsorted(times, since, side="right")), 1), k + 1):
-            rotate_attitude(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
-        return attitude
+    def _propagated(self, pose: Pose) -> Pose:
+        """Return a Pose propagated to the present by the inertial samples. It keeps its stamp."""
+        since, (p, v, q), of = pose[0], (part.copy() for part in pose[1:]), self.simulator
+        first = max(int(np.searchsorted(of.times, since, side="right")), 1)
+        rows = slice(first, of.done + 1)
+        integrate(since, p, v, q, of.times[rows], of.samples[rows] - self._offsets)
+        return since, p, v, q
 
     @property
     def result(self) -> TrialResult:

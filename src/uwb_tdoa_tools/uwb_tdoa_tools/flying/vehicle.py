@@ -279,11 +279,8 @@ def specific_force(before: np.ndarray, after: np.ndarray, dt: float, out: np.nda
     out : numpy.ndarray
         Specific force (3,), m/s^2, body frame of `after`. It is written.
     """
-    back = np.empty(4)
-    back[0], back[1], back[2], back[3] = -after[6], -after[7], -after[8], after[9]
-    a = np.empty(3)
-    for k in range(3):
-        a[k] = (after[3 + k] - before[3 + k]) / dt
+    back = np.array([-after[6], -after[7], -after[8], after[9]])
+    a = (after[3:6] - before[3:6]) / dt
     a[2] += GRAVITY
     rotate(back, a, out)
 

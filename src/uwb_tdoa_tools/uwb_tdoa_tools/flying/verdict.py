@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.results import Odometry, rows_of
 
 from ..bags.bag import write_bag
 from ..scoring.metrics import nees, position_at, rms
-from .mission import DONE, REFUSED, Journey, Mission
+from .mission import DONE, REFUSED, Journey, Mission, yaw_of
 from .rover import Drive, drive
 from .trial import REST_AFTER, Task, TrialResult, fly
 from .vehicle import POSITION, VELOCITY
@@ -146,16 +146,19 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
     way = truth.p[(truth.t >= started) & (truth.t <= ended)][::8, :2]
     off = np.linalg.norm(way - mission.path.at(mission.path.nearest(way))[:, :2], axis=1)
     place = float(np.linalg.norm(truth.p[-1, :2] - mission.place))
-    why = flown.crash or ("refused to start" if mission.state == REFUSED else "")
-    if not why and mission.state != DONE:
-        why = "did not arrive in time"
-    if not why and place >= NEAR:
-        why = "arrived elsewhere"
+    why = _first_reason(
+        {
+            flown.crash: flown.crash,
+            "refused to start": mission.state == REFUSED,
+            "did not arrive in time": mission.state != DONE,
+            "arrived elsewhere": place >= NEAR,
+        }
+    )
     odometry = sampled(rows_of(flown.odometry, flown.odometry.t <= end), SPACING)
     error = (odometry.p - position_at(odometry.t, truth))[:, :2]
     under_way = (odometry.t >= started) & (odometry.t <= ended)
-    yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
-    off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
+    yaw = np.interp(odometry.t, truth.t, np.unwrap(yaw_of(truth.q)))
+    off_yaw = ((yaw_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
     variance = odometry.covariance[under_way, 8, 8]  # about the vertical, for a planar vehicle
     has_variance = len(off_yaw) > 0 and bool((variance > 0.0).all())
     begins = dict(zip(DRIVE_PHASES, (-math.inf, started, ended)))
@@ -197,28 +200,26 @@ def _common(flown: TrialResult, mission: Journey, end: float) -> dict[str, Any]:
     return figures
 
 
-def yaws_of(q: np.ndarray) -> np.ndarray:
-    """Return the yaws (n,), rad, of attitudes (n, 4) x y z w."""
-    x, y, z, w = q.T
-    out: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
-    return out
-
-
 def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
     """Return the reason of the failure, or ""."""
-    if mission.state == REFUSED:
-        return "refused to arm"
-    if not figures["took_off"]:
-        return f"{crash} on the ground" if crash else "did not take off"
-    if crash:
-        return crash
-    if not figures["upright"]:
-        return "not upright"
-    if figures["touchdown"] is None or mission.ended is None:
-        return "did not come down"
-    if figures["touchdown"] >= SLOW:
-        return "came down hard"
-    return "landed elsewhere" if figures["place"] >= NEAR else ""
+    came_down = figures["touchdown"] is not None and mission.ended is not None
+    return _first_reason(
+        {
+            "refused to arm": mission.state == REFUSED,
+            f"{crash} on the ground": crash and not figures["took_off"],
+            "did not take off": not figures["took_off"],
+            crash: crash,
+            "not upright": not figures["upright"],
+            "did not come down": not came_down,
+            "came down hard": came_down and figures["touchdown"] >= SLOW,
+            "landed elsewhere": figures["place"] >= NEAR,
+        }
+    )
+
+
+def _first_reason(reasons: dict[str, Any]) -> str:
+    """Return the first reason that holds, or ""."""
+    return next((reason for reason, holds in reasons.items() if holds), "")
 
 
 def sampled(odometry: Odometry, spacing: float) -> Odometry:
@@ -335,17 +336,19 @@ def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
         Verdicts of one vehicle, see `verdict_of`.
     """
     wording = wording_of(verdicts[0])
-    out = {"flights": len(verdicts), wording.goal: sum(one[wording.goal] for one in verdicts)}
-    out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
-    out["safe"] = sum(one["safe"] for one in verdicts)
-    out["armed"] = sum(one["started"] is not None for one in verdicts)
     known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
-    out["armed_beyond_three_deviations"] = (
-        sum(value > OVERCONFIDENT for value in known) if known else None
-    )
-    out["reported_lost"] = sum(one["reported_lost"] is not None for one in verdicts)
-    for name in wording.figures:
-        out[name] = _spread([one[name] for one in verdicts])
+    out = {
+        "flights": len(verdicts),
+        wording.goal: sum(one[wording.goal] for one in verdicts),
+        "why": dict(Counter(one["why"] for one in verdicts if one["why"]).most_common()),
+        "safe": sum(one["safe"] for one in verdicts),
+        "armed": sum(one["started"] is not None for one in verdicts),
+        "armed_beyond_three_deviations": (
+            sum(value > OVERCONFIDENT for value in known) if known else None
+        ),
+        "reported_lost": sum(one["reported_lost"] is not None for one in verdicts),
+    }
+    out |= {name: _spread([one[name] for one in verdicts]) for name in wording.figures}
     for phase in wording.phases:
         mine = [one["phases"][phase] for one in verdicts if phase in one["phases"]]
         out[phase] = {
