@@ -258,7 +258,7 @@ def test_inertial_samples_propagate_position_velocity_and_attitude(plain):
 class Wrong(OwnFilter):
     """An estimate that is certain, and wrong from 12 s on."""
 
-    speed, turn, unsure, yaw_known = 0.0, 0.0, False, True
+    speed, decay, turn, unsure, yaw_known = 0.0, math.inf, 0.0, False, True
 
     @property
     def pose(self):
@@ -267,7 +267,8 @@ class Wrong(OwnFilter):
             return pose
         t, p, v, q = pose
         turned = Rotation.from_euler("z", self.turn * (t - 12.0)) * Rotation.from_quat(q)
-        return t, p, v + [0.0, self.speed, 0.0], turned.as_quat()
+        speed = self.speed * math.exp((12.0 - t) / self.decay)
+        return t, p, v + [0.0, speed, 0.0], turned.as_quat()
 
     @property
     def deviation(self):
@@ -282,6 +283,18 @@ def test_an_estimate_that_the_imu_contradicts_is_not_flown_by(speed, turn):
     trial.fly()
     verdict = verdict_of(trial.result)
     assert verdict["safe"] and 12.0 < verdict["reported_lost"] < 13.5
+
+
+def test_an_estimate_that_becomes_right_again_is_flown_by():
+    source = Wrong(PERFECT.anchors, FilterConfig())
+    source.speed, source.decay, source.yaw_known = 1.2, 0.1, False
+    trial = Trial(Task(PERFECT, 3, "place", path=SHORT), source)
+    trial.begin()
+    while not trial.over:
+        source.yaw_known = trial.simulator.now > 12.0  # so the wrong estimates are compared with
+        trial.turn()
+    verdict = verdict_of(trial.result)
+    assert verdict["landed"] and verdict["reported_lost"] is None
 
 
 def test_without_a_yaw_a_lost_vehicle_does_not_go_on():

@@ -163,9 +163,8 @@ class OwnFilter(EstimateSource):
 
     @property
     def yaw_known(self) -> bool:
-        newest = self.newest
-        return newest is not None and bool(
-            rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2] <= YAW_KNOWN
+        return self.newest is not None and bool(
+            rotation_std(self.newest.q[-1:], self.newest.covariance[-1:])[0, 2] <= YAW_KNOWN
         )
 
     def _add(self, name: str, part: Any) -> None:
@@ -212,15 +211,15 @@ MEMORY, AT_REST, LIFT_OFF, SETTLED = 2.0, 1.0, 4.0, 1.0
 FARTHER, FASTER, TURNED = 2.5, 0.4, 0.13
 
 
-def _differ(one: Pose, other: Pose, deviation: float, age: float) -> bool:
-    """Return whether two poses differ by more than `age`, s, of inertial samples explain.
+def _difference(one: Pose, other: Pose, deviation: float, age: float) -> float:
+    """Return the difference of two poses in units of what `age`, s, of inertial samples explains.
 
     deviation : float
         Stated standard deviation of a coordinate, m.
     """
     far, fast = (float(np.linalg.norm(one[k] - other[k])) for k in (1, 2))
     turn = 2.0 * math.acos(min(1.0, abs(float(one[3] @ other[3]))))
-    return max(far / (FARTHER * deviation), fast / FASTER, turn / TURNED) > max(age, MEMORY)
+    return max(far / (FARTHER * deviation), fast / FASTER, turn / TURNED) / max(age, MEMORY)
 
 
 @dataclass(frozen=True)
@@ -422,24 +421,26 @@ class Trial:
 
     def _samples(self, seconds: float) -> np.ndarray:
         """Return the inertial samples (n, 6) of the last seconds."""
-        end = self.simulator.done + 1
-        return self.simulator.samples[max(end - 1 - int(seconds * IMU_RATE), 0) : end]
+        of = self.simulator
+        return of.samples[max(of.done - int(seconds * IMU_RATE), 0) : of.done + 1]
 
     def _own_pose(self, mission: Mission, pose: Pose | None) -> Pose | None:
         """Return an estimate of before, propagated by the IMU, and compare the newest `pose` with it.
 
-        After lift-off a contradiction means that the estimate is wrong. During lift-off it means that the
-        IMU is not precise enough, for example because the rotors shake it.
+        After lift-off a contradiction means that the estimate is wrong. It must have been right until the
+        middle of the time between: otherwise it was wrong before, and is right again. During lift-off a
+        contradiction means that the IMU is not precise enough, for example because the rotors shake it.
         """
         if pose is None or not self._past or not self._own_usable:
             return None
         before, deviation = self._past[0]
-        own = self._propagated(before)
-        differ = _differ(pose, own, deviation, self.simulator.now - before[0])
+        own, middle = (self._propagated(self._past[k][0]) for k in (0, len(self._past) // 2))
+        age = self.simulator.now - before[0]
+        late, early = (_difference(one, own, deviation, age) for one in (pose, middle))
         if mission.path_time < LIFT_OFF:
-            self._own_usable = not differ
+            self._own_usable = late < 1.0
         else:
-            self._contradicted |= differ
+            self._contradicted |= late > 1.0 and early < 0.5
         return own
 
     def _schedule_faults(self, mission: Any) -> None:
