@@ -208,7 +208,8 @@ GIVEN_AT, GIVEN_STD = 0.3, 0.1
 MEMORY, AT_REST, LIFT_OFF, SETTLED = 2.0, 1.0, 4.0, 1.0
 # difference that contradicts, for each second of the age: position in stated deviations, m/s, rad.
 # 60 flights without a fault reach 2.1, 0.31 and 0.03.
-FARTHER, FASTER, TURNED = 2.5, 0.4, 0.13
+# During lift-off, ROUGH times that means an IMU that is too rough: shaking rotors reach 5.
+FARTHER, FASTER, TURNED, ROUGH = 2.5, 0.4, 0.13, 2.0
 
 
 def _difference(one: Pose, other: Pose, deviation: float, age: float) -> float:
@@ -409,6 +410,8 @@ class Trial:
             pose, self._last_lost = own or pose, now
         elif source.yaw_known and now > self._last_lost + SETTLED:
             self._past.append((source.pose, source.deviation))
+            while self._past[0][0][0] < now - 2.0 * MEMORY:  # from before the vehicle was lost
+                self._past.popleft()
         self.controller.fly(*pose[1:], wanted, mission.yaw, DT)
 
     def _stop(self) -> None:
@@ -421,8 +424,8 @@ class Trial:
 
     def _samples(self, seconds: float) -> np.ndarray:
         """Return the inertial samples (n, 6) of the last seconds."""
-        of = self.simulator
-        return of.samples[max(of.done - int(seconds * IMU_RATE), 0) : of.done + 1]
+        first = max(self.simulator.done - int(seconds * IMU_RATE), 0)
+        return self.simulator.samples[first : self.simulator.done + 1]
 
     def _own_pose(self, mission: Mission, pose: Pose | None) -> Pose | None:
         """Return an estimate of before, propagated by the IMU, and compare the newest `pose` with it.
@@ -438,7 +441,7 @@ class Trial:
         age = self.simulator.now - before[0]
         late, early = (_difference(one, own, deviation, age) for one in (pose, middle))
         if mission.path_time < LIFT_OFF:
-            self._own_usable = late < 1.0
+            self._own_usable = late < ROUGH
         else:
             self._contradicted |= late > 1.0 and early < 0.5
         return own
