@@ -723,9 +723,9 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
-    settled = not ekf.sensed or (hypotheses.alike(ekf) and yaw_check.known(best.x, best.P))
-    if t - ekf.recovered < RECOVERY_NAMED and not settled:
-        ekf.recovered = t
+    if t - ekf.recovered < RECOVERY_NAMED and ekf.sensed:
+        if not (hypotheses.alike(ekf) and yaw_check.known(best.x, best.P)):
+            ekf.recovered = t
     workspace.add_circle(
         ekf,
         parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.MEMORY,
