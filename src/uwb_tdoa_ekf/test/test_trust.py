@@ -22,12 +22,12 @@ BEGIN, END = 8.0, 12.0  # s, of a fault
 QUIET = {"tdoa_std": 0.05, "accel_noise": 0.01, "gyro_noise": 0.001}
 
 
-def looks(flight, at=()):
+def looks(flight, at=(), config=None):
     """Yield (s, Estimator, newest Odometry) every STEP.
 
     at : (s, call) : call(estimator) is made at that time
     """
-    estimator, calls = Estimator(flight.anchors), list(at)
+    estimator, calls = Estimator(flight.anchors, config), list(at)
     for t in np.arange(0.0, flight.imu.t[-1], STEP):
         imu, uwb = ((part.t >= t) & (part.t < t + STEP) for part in (flight.imu, flight.tdoa))
         while calls and calls[0][0] <= t:
@@ -57,11 +57,11 @@ def judge(flight):
     for _, estimator, odometry in looks(flight):
         error = error_of(flight, odometry)
         std = math.sqrt(np.trace(odometry.covariance[-1, :3, :3]))
-        said = {estimator.unsure} | {of.cause for of in estimator.findings} - {None}
-        certain = not said - {None} and yaw_std(odometry) < YAW_KNOWN
+        said = {estimator.unsure, *(of.cause for of in estimator.findings)} - {None}
+        certain = not said and yaw_std(odometry) < YAW_KNOWN
         stretch = stretch + 1 if certain and error > max(1.0, 3.0 * std) else 0
         longest, largest = max(longest, stretch), max(largest, error)
-        reasons |= said - {None}
+        reasons |= said
     return largest, reasons, longest * STEP
 
 
@@ -105,14 +105,14 @@ def test_an_imu_whose_motion_tdoas_contradict_is_left_out(axes):
 
 
 def of_places(flight, places, anchors, during):
-    """Return the Flight whose TDOAs are those of other places, or other anchors, for a while."""
+    """Return the Flight with the TDOAs of other places or other anchors, where `during` is true."""
     of, uwb = flight.anchors, flight.tdoa
     a, b = (anchors[of.index(ids)] for ids in (uwb.a, uwb.b))
     return replace(flight, tdoa=replace(uwb, d=np.where(during, tdoa(places, a, b), uwb.d)))
 
 
 def of_another_survey(flight, rng):
-    """For 5 s the TDOAs are those of other anchors."""
+    """Return the Flight with the TDOAs of other anchors for 5 s."""
     t, positions = flight.tdoa.t, flight.anchors.positions
     other = positions[rng.permutation(len(positions))] * [0.8, 1.2, 1.0]
     return of_places(flight, position_at(flight, t), other, (t > BEGIN) & (t < BEGIN + 5.0))
@@ -202,6 +202,15 @@ def test_a_range_finder_that_tdoas_contradict_is_named_and_moves_little(fault):
         assert certain < 2.0
         assert any("the range finder" in words or "was wrong" in words for words in reasons)
     assert np.sort(found)[2] < 0.5
+
+
+def test_a_fixed_height_that_tdoas_contradict_is_named():
+    flight = fly(4, 12.0, hover=True, **QUIET)
+    z = float(flight.truth.p[0, 2])
+    for off, named in ((1.4, True), (0.0, False)):
+        config = FilterConfig(fixed_height=z - off, fixed_height_std=0.05)
+        said = {estimator.unsure for _, estimator, _ in looks(flight, config=config)}
+        assert any("fixed_height, and it is not used" in (words or "") for words in said) == named
 
 
 def test_what_a_fault_has_spoiled_is_opened_and_settles():

@@ -188,9 +188,10 @@ class Estimator:
                 "look for what has changed in TDOAs or IMU"
             )
         if ekf.t < ekf.height.ignored_until:
-            held = self.config.known_height_std > 0.0
-            of = "fixed_height" if held else "the range finder"
-            return f"TDOAs contradict {of}, and it is not used: check it and its deviation"
+            held = self.config.fixed_height_std > 0.0 and not self.config.planar
+            names = ("fixed_height", "fixed_height_std"), ("the range finder", "height_std")
+            of, std = names[0] if held else names[1]
+            return f"TDOAs contradict {of}, and it is not used: check it, {std}"
         if ekf.velocity.contradicted:
             return "TDOAs contradict the wheels, and they are not used: check if they slip or stick"
         return None

@@ -319,9 +319,8 @@ class Journey:
 DESCENT_LEAD = 0.15
 # s, averaging time of the support in the air, where an offset of the accelerometer is all of it
 SUPPORT_OFFSET_TIME = 2.0
-CONTACT_TIME = (
-    0.15  # s of support that mean ground contact to a lost vehicle: it brakes hard at first
-)
+# s of support that mean ground contact to a lost vehicle: it brakes hard at first
+CONTACT_TIME = 0.15
 
 
 class Mission(Journey):
