@@ -25,7 +25,7 @@ from sensor_msgs.msg import FluidPressure
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import LINE_LENGTH, InputError
-from uwb_tdoa_bias.ros import node as served, parameters
+from uwb_tdoa_bias.ros import node as served, parameters, topics
 from uwb_tdoa_bias.ros.anchors import (
     ANCHORS_QOS,
     ANY_QOS,
@@ -438,6 +438,33 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 60.0
     spinner.close()
+
+
+def test_messages_that_a_full_queue_drops_are_counted(surroundings, monkeypatch):
+    node, other = surroundings
+    monkeypatch.setattr(topics, "STREAM_QOS", QoSProfile(depth=5))
+    taken = []
+    streams = pressures(node, lambda frame, t, rows, arrival: taken.extend(t))
+    first = other.create_publisher(FluidPressure, "pressure", DEEP)
+    until(first.get_subscription_count)
+
+    def publish(publisher, count):
+        for _ in range(count):
+            publisher.publish(FluidPressure())
+        assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=120.0))
+        until(lambda: streams.take(True))
+
+    publish(first, 1)
+    publish(first, 50)
+    end = streams.inputs["pressure"]
+    until(lambda: streams.take(True) or end.lost + len(taken) == 51)
+    assert end.lost == 45 and len(taken) == 6
+    assert "45 of 51 messages on pressure were lost" in end.trouble(6)
+    second = other.create_publisher(FluidPressure, "pressure", DEEP)
+    until(lambda: end.get_publisher_count() == 2)
+    for publisher in (second, first, second):  # their numbers have nothing to do with each other
+        publish(publisher, 1)
+    assert end.lost == 45 and "2 publish on pressure" in end.trouble(3)
 
 
 def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():

@@ -15,7 +15,6 @@ from typing import Any, TypeVar, overload
 
 from builtin_interfaces.msg import Time
 import numpy as np
-from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
@@ -241,21 +240,20 @@ class StreamInput:
 
     Attributes
     ----------
-    lost : messages that DDS reports as sent and not delivered
+    lost : messages that are missing in the sequence numbers of the only publisher
     refusals : Refusals
     """
 
     def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:
         self.lost, self._before = 0, 0
+        self._number: int | None = None  # of the last message, by its publisher
         self.refusals = Refusals(node, topic, kind)
         self._node, self._topic = node, topic
-        events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
             kind,
             topic,
             unserved,
             copy(STREAM_QOS),
-            event_callbacks=events,
             qos_overriding_options=OVERRIDES,
             raw=True,
         )
@@ -269,6 +267,7 @@ class StreamInput:
         for data, information in waiting(self._subscription):
             messages.append(data)
             stamps.append(information["received_timestamp"] or time.time_ns())
+            self._count_lost(information["publication_sequence_number"])
         if not messages:
             return []
         arrivals = 1e-9 * np.array(stamps)
@@ -277,8 +276,16 @@ class StreamInput:
             for frame, rows, some in codec.read(messages, self.refusals.add)
         ]
 
-    def _on_lost(self, status: QoSMessageLostInfo) -> None:
-        self.lost += status.total_count_change
+    def _count_lost(self, number: int | None) -> None:
+        """Count the messages missing before `number`; None from a middleware without numbers.
+
+        The event of a lost message is not used: rmw_fastrtps can lock itself when it is taken (its pull
+        request 890).
+        """
+        before, self._number = self._number, number
+        if before is not None and number is not None and number > before + 1:
+            if self.get_publisher_count() == 1:
+                self.lost += number - before - 1
 
     def get_publisher_count(self) -> int:
         """Return the number of publishers of the topic."""
