@@ -26,7 +26,6 @@ from .core.hypotheses import yaw_offset
 from .core.memory import (
     INVALID,
     ODOMETRY,
-    POSE,
     RESIDUAL,
     SENSOR_ROW,
     TDOA,
@@ -371,7 +370,7 @@ def run_offline(
     config: FilterConfig | None = None,
     corrector: Corrector | None = None,
     records: list[np.ndarray] | None = None,
-    path: Odometry | None = None,
+    tdoas: list[np.ndarray] | None = None,
 ) -> Run:
     """Run bias correction and filter on a Flight and return a Run.
 
@@ -388,9 +387,8 @@ def run_offline(
         Its stored poses are cleared first. None applies no correction.
     records : list or None
         Receives the history of the filter (see engine.feed).
-    path : Odometry or None
-        Estimates of an earlier run. The TDOAs are linearized on this path, and the filter starts
-        with the first TDOA, from an unknown position. None: linearized at the prediction.
+    tdoas : list or None
+        Receives the corrected TDOAs, in arrays of TDOA.
     """
     config = config or FilterConfig()
     corrector = corrector or Corrector(flight.anchors)
@@ -422,13 +420,11 @@ def run_offline(
         rows = structured(
             TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state
         )
-        if path is not None and len(rows):
-            rows["smoothed"] = True
-            rows["position"] = np.stack([np.interp(t, path.t, axis) for axis in path.p.T], axis=1)
-            if not pipeline.state.record.running:
-                pipeline.set_pose(structured(POSE, t[:1], math.nan, 0.0, math.nan))
         usable = usable_tdoas(rows, anchors.positions)
-        buffer.load(TDOA_STREAM, rows if usable.all() else rows[usable])
+        rows = rows if usable.all() else rows[usable]
+        buffer.load(TDOA_STREAM, rows)
+        if tdoas is not None:
+            tdoas.append(rows)
         of_tdoas.append(batch[usable])
         fed = pipeline.run(buffer, until)
         parts += fed

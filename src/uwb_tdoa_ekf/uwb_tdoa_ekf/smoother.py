@@ -22,7 +22,6 @@ import math
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
@@ -30,13 +29,12 @@ from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
-from .core import auxiliary, noise, plane
+from .core import auxiliary, horizon, noise, plane, workspace
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
-from .core.memory import ODOMETRY, RESIDUAL, USED, joined, structured
+from .core.memory import ODOMETRY, RESIDUAL, USED, joined, new_state, structured
 from .core.state import ERROR_STATES, MOVING_STATES, inject
-from .core.update import SMALLEST
 from .offline import Run, may_have_offset, run_offline, without_offset, without_unknown_offset
 from .results import OF_ROW, Odometry
 
@@ -45,11 +43,6 @@ LAGS = 64  # most ranges of one anchor over which their errors are compared
 FEWEST_RANGES = 4 * LAGS  # of one anchor; fewer show no correlation
 OUTLIER = 3.0  # standard deviations to which a residual is limited
 ANY_DISTANCE = 1000.0  # m, and s: longer than errors of ranges stay alike
-# Iterated smoother: TDOAs a second below which it runs, number of runs, run in which noise and motion
-# are fitted, standard deviation of their logarithms, most runs of the fit, and standard deviations at
-# which the loss bends: Gaussian noise then loses 5 % of its information.
-SPARSE, PASSES, FITTED, FACTOR, MOST_RUNS, BEND = (15.0, 10, 6, math.log(2.0), 30, 4.0)
-LARGEST_NIS = 25.0  # normalized residual squared; limits the loss of an outlier
 
 
 def smooth(
@@ -61,8 +54,7 @@ def smooth(
     yaw is unknown, the smoother uses the final yaw hypothesis from the start. An unknown common
     range offset (`range_offset_std`) is treated the same way and needs a second smoothing run. If
     the flight has ranges and no TDOAs, their correlation length is measured first
-    (`correlation_length`). If a tag without IMU sends few TDOAs, the smoother is iterated
-    (`_iterated`). The memory is 3.5 kB per update.
+    (`correlation_length`). A tag alone that sends few TDOAs is smoothed by `horizon.smooth`. The memory is 3.5 kB per update.
 
     Parameters
     ----------
@@ -84,9 +76,9 @@ def smooth(
     config = replace(config, **auxiliary.NONE)
     value, std = offset or (0.0, 0.0)
     nearer = flight if offset is None else without_offset(flight, value)
-    run = _smoothed_run(nearer, config, corrector)[0]
-    if _is_sparse(flight, config, run.odometry):
-        return _iterated(flight, config, corrector, run)
+    if _is_alone(flight, config):
+        return _smoothed_alone(flight, config, corrector)
+    run = _smoothed_run(nearer, config, corrector)
     if nearer.range is not None and not len(nearer.tdoa) and len(run.odometry):
         corrector = corrector or Corrector(flight.anchors)
         length = correlation_length(nearer, run.odometry, corrector.effects)
@@ -95,10 +87,10 @@ def smooth(
             config = replace(
                 config, tdoa_correlation_time=seconds, tdoa_correlation_distance=ANY_DISTANCE
             )
-            run = _smoothed_run(nearer, config, corrector)[0]
+            run = _smoothed_run(nearer, config, corrector)
     if offset is None:
         return run
-    beside = _smoothed_run(without_offset(flight, value + std), config, corrector)[0]
+    beside = _smoothed_run(without_offset(flight, value + std), config, corrector)
     return replace(
         run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset
     )
@@ -151,80 +143,52 @@ def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -
     return 2.0 * float(fallen[0] if len(fallen) else LAGS)
 
 
-def _is_sparse(flight: Flight, config: FilterConfig, odometry: Odometry) -> bool:
-    """Return whether a tag alone sends few TDOAs, and the filter is uncertain for half of the time.
-
-    The prediction is then too far from the tag for a linearization.
-    """
-    felt = config.use_imu and flight.imu is not None
-    alone = not felt and flight.velocity is None and flight.range is None
-    few = len(flight.tdoa) < SPARSE * flight.duration
-    variance = np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2)
-    return alone and few and config.adapt_noise and bool(np.mean(variance > SMALLEST**2) > 0.5)
+def _is_alone(flight: Flight, config: FilterConfig) -> bool:
+    """Return whether a tag sends few TDOAs, and no other sensor measures."""
+    others = flight.velocity, flight.range, flight.height, flight.imu if config.use_imu else None
+    held = config.planar or config.fixed_height_std > 0.0
+    few = len(flight.tdoa) < horizon.BEGINS * flight.duration
+    return few and not held and config.adapt_noise and all(other is None for other in others)
 
 
-def _iterated(flight: Flight, config: FilterConfig, corrector: Corrector | None, run: Run) -> Run:
-    """Return a smoothed Run whose path is linearized on itself: batch least squares of all TDOAs.
-
-    The iterated Kalman smoother is a Gauss-Newton method (B. Bell, The iterated Kalman smoother as a
-    Gauss-Newton method, SIAM J. Optimization 4, 1994). Noise and random acceleration maximize the
-    likelihood of each TDOA given all others, with the configured ones as prior.
-
-    Parameters
-    ----------
-    flight, config, corrector
-        As for _smoothed_run.
-    run : Run
-        Result of _smoothed_run. Its path is the first to linearize on. Its residuals are kept.
-    """
-    config = replace(config, adapt_noise=False, recover=False, measurement_scale=BEND)
-    prior = x = np.log([config.tdoa_std, config.motion_noise])
+def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
+    """Return the Run of a tag alone with few TDOAs, smoothed by `horizon.smooth`."""
+    parts: list[np.ndarray] = []
+    run = run_offline(flight, config, corrector, tdoas=parts)
+    tdoas = np.unique(np.concatenate(parts))  # sorted by stamp, without repeats
     path = run.odometry
-
-    def smooth_at(x: np.ndarray) -> tuple[Run, float]:
-        tdoa_std, motion_noise = np.exp(x).tolist()
-        given = replace(config, tdoa_std=tdoa_std, motion_noise=motion_noise)
-        return _smoothed_run(flight, given, corrector, path)
-
-    def loss(x: np.ndarray) -> float:
-        return smooth_at(x)[1] + 0.5 * float(np.sum((x - prior) ** 2)) / FACTOR**2
-
-    for number in range(PASSES):
-        if number == FITTED:
-            simplex = x - FACTOR * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-            options = {"maxfev": MOST_RUNS, "initial_simplex": simplex}
-            x = minimize(loss, x, method="Nelder-Mead", options=options).x
-        path = smooth_at(x)[0].odometry
-    return replace(run, odometry=path)
+    begin = np.stack([np.interp(tdoas["t"], path.t, axis) for axis in path.p.T], axis=1)
+    state = new_state(flight.anchors.positions)
+    bounds = np.empty((2, 3))
+    workspace.set_bounds(state.record.extent, config.workspace_margin, bounds)
+    rows = horizon.smooth(tdoas, state.anchors, config.parameters(), bounds, begin)
+    number = np.floor(rows["t"] * config.odometry_rate)
+    rows = rows[np.append(number[1:] != number[:-1], True)]
+    last = np.maximum(np.searchsorted(path.t, rows["t"], side="right") - 1, 0)
+    rows["x"][:, 6:] = np.hstack([path.q, path.accel_bias, path.gyro_bias])[last]
+    rows["covariance"][:, 6:, 6:] = path.covariance[last, 6:, 6:]
+    rows["rate"], rows["rate_variance"] = path.rate[last], path.rate_variance[last]
+    return replace(run, odometry=_with_persistent(Odometry.from_rows(rows), path))
 
 
-def _smoothed_run(
-    flight: Flight, config: FilterConfig, corrector: Corrector | None, path: Odometry | None = None
-) -> tuple[Run, float]:
-    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE, and its loss.
-
-    The loss is minus the log likelihood of each measurement given all others. path is as for
-    run_offline.
-    """
+def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
+    """Return the smoothed Run for a known yaw and a config changed by auxiliary.NONE."""
     records: list[np.ndarray] = []
-    result = run_offline(flight, config, corrector, records, path)
+    result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
     # stamp of the record before each array of records
     before = [-math.inf, *(part["t"][-1] for part in records)]
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
-    rows, total = [np.empty(0, ODOMETRY)], 0.0
+    rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
         room = np.zeros(len(records[k]), ODOMETRY)
-        count, loss = _backward(
-            records[k], before[k], config.odometry_rate, adjoint, information, room
-        )
+        count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
         rows.append(room[len(room) - count :])
-        total += loss
     smoothed = np.concatenate(rows[::-1])
     if config.planar:
         plane.flatten_all(smoothed, config.parameters())
     odometry = _with_persistent(Odometry.from_rows(smoothed), result.odometry)
-    return replace(result, odometry=odometry), total
+    return replace(result, odometry=odometry)
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
@@ -274,8 +238,8 @@ def _backward(
     adjoint: np.ndarray,
     information: np.ndarray,
     rows: np.ndarray,
-) -> tuple[int, float]:
-    """Run the smoother backwards through records, and return the number of rows written and the loss.
+) -> int:
+    """Run the smoother backwards through records, and return the number of rows written.
 
     Parameters
     ----------
@@ -292,7 +256,7 @@ def _backward(
     rows : (n,) array of ODOMETRY
         Filled from its end.
     """
-    count, loss = 0, 0.0
+    count = 0
     for i in range(len(records) - 1, -1, -1):
         record = records[i]
         earlier = records[i - 1].t if i > 0 else before
@@ -303,9 +267,9 @@ def _backward(
             adjoint[:] = 0.0
             information[:, :] = 0.0
         else:
-            loss += _through_update(record, adjoint, information)
+            _through_update(record, adjoint, information)
             _through_prediction(record.transition, adjoint, information)
-    return count, loss
+    return count
 
 
 @compiled
@@ -321,8 +285,8 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
 
 
 @compiled
-def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> float:
-    """Step `adjoint` and `information` backwards through one scalar update, and return its loss.
+def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
+    """Step `adjoint` and `information` backwards through one scalar update.
 
     The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S with C = I -
     K h. In the code:
@@ -330,10 +294,6 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
     - lambda, Lambda: adjoint, information
     - h, K: record.jacobian, record.gain
     - y, S: record.innovation and its record.variance
-
-    The residual of the measurement to the estimate by all others is u / M, its variance 1 / M, with u =
-    K' lambda + y / S and M = K' Lambda K + 1 / S (P. de Jong, A cross-validation filter for time series
-    models, Biometrika 75, 1988). The loss is half of u^2 / M - log M.
     """
     h, gain = record.jacobian, record.gain
     information_gain = np.dot(information, gain)  # Lambda K
@@ -343,8 +303,6 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
     cross = np.outer(h, information_gain)
     adjoint -= adjoint_factor * h
     information += information_factor * np.outer(h, h) - cross - cross.T
-    nis = min(adjoint_factor**2 / information_factor, LARGEST_NIS)
-    return 0.5 * (nis - math.log(information_factor))
 
 
 @compiled

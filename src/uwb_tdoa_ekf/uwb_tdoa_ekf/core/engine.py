@@ -28,6 +28,7 @@ from . import (
     ground,
     height,
     history,
+    horizon,
     hypotheses,
     imu_fault_detector,
     inertial,
@@ -48,6 +49,7 @@ from .memory import (
     HYPOTHESES,
     N_YAWS,
     ODOMETRY,
+    OFF,
     REJECTED,
     REPEATED,
     RESIDUAL,
@@ -237,16 +239,20 @@ def _on_tdoa(
     initialization.remember(ekf, tdoa)
     t = tdoa.t
     if not _predict_or_initialize(ekf, anchors, parameters, t, records):
+        if ekf.running and not len(records):
+            horizon.step(ekf, anchors, parameters, t)
         return
     before = ekf.position_unknown_until
     _prepare(ekf, anchors, parameters, t, records)
     if parameters.recover and initialization.hold_for_search(
         ekf, anchors, parameters, t, ekf.position_unknown_until > before, records
     ):
-        ekf.last_tdoa = t
+        ekf.last_tdoa, ekf.horizon.state = t, OFF
         return
     late = _update(ekf, anchors, parameters, tdoa, residual, records)
     initialization.relocate(ekf, anchors, parameters, t, records)
+    if not len(records):  # the smoother needs a recursive filter
+        horizon.step(ekf, anchors, parameters, t)
     _select(ekf, parameters, t, records)
     if not late:
         _note_agreement(ekf, t, abs(residual.innovation) < INLIER)
@@ -599,8 +605,7 @@ def _compare(
     """Fill in the innovation of a TDOA for a HYPOTHESIS.
 
     The Jacobian contains the position, and the slope of the bias. The slope counts only within
-    LINEAR_RANGE of the state at which the bias was computed. A TDOA with a smoothed position is
-    linearized there.
+    LINEAR_RANGE of the state at which the bias was computed.
 
     Parameters
     ----------
@@ -615,15 +620,10 @@ def _compare(
     innovation : INNOVATION
         Filled by this function.
     """
-    if tdoa.smoothed:
-        predicted = linearized_tdoa(tdoa.position, a.position, b.position, innovation.row)
-        predicted += np.sum(innovation.row[:3] * (hypothesis.x[:3] - tdoa.position))
-        innovation.curvature = 0.0
-    else:
-        predicted = linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
-        innovation.curvature = update.second_order_variance(
-            hypothesis.x, hypothesis.P, a.position, b.position
-        )
+    predicted = linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+    innovation.curvature = update.second_order_variance(
+        hypothesis.x, hypothesis.P, a.position, b.position
+    )
     innovation.value, innovation.entries = tdoa.d - known - predicted, 3
     for k in range(N_STATES):
         innovation.states[k] = k

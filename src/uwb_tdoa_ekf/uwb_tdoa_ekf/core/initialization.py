@@ -24,7 +24,7 @@ from . import (
 )
 from .ground import SPEED, KnownHeight
 from .history import add_reset
-from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
+from .memory import HYPOTHESES, N_PLACES, N_YAWS, OFF, STARTED, WINDOW
 from .startup import APART, Places, inliers, level, locate, room_for, split
 from .state import CHECK_PERIOD, GRAVITY, turn_about_vertical, yaw_of
 from .workspace import ANY_YAW
@@ -120,6 +120,7 @@ def _start_at(
         yaw_std, ekf.attitude_reset = YAW_SEARCH_STD, True
     _begin(ekf, parameters, t, places, yaw, yaw_std, parameters.use_imu)
     ekf.resting, ekf.rest_since = resting, t
+    ekf.horizon.state = STARTED
     add_reset(ekf, t, history)
 
 
@@ -330,7 +331,14 @@ def relocate(
         return
     for h in range(HYPOTHESES):
         hypotheses.set_state(ekf.hypotheses[h], x[0], covariance[0])
+    ekf.horizon.state = STARTED
     add_reset(ekf, t, history)
+
+
+@compiled
+def last_few(ekf: Record) -> np.ndarray:
+    """Return the TDOAs of a start with few TDOAs that ends with the newest one, (n,) TDOA."""
+    return _last(ekf, ekf.window[ekf.kept - 1].t)[0]
 
 
 @compiled
@@ -436,6 +444,7 @@ def set_pose(
                 if h != ekf.best:
                     hypothesis.log_weight = -np.inf
     ekf.consistency, ekf.late_as_known = 1.0, False
+    ekf.horizon.state = OFF
     add_reset(ekf, t, history)
 
 
@@ -569,7 +578,7 @@ def recover(
         if not parameters.use_imu:
             # wheels have led to a wrong place: a wrong yaw is a probable cause
             hypotheses.set_yaw_variance(hypothesis, ANY_YAW**2)
-    ekf.rival_since = -np.inf
+    ekf.rival_since, ekf.horizon.state = -np.inf, OFF
     if anywhere:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     else:
@@ -672,6 +681,7 @@ def widen(ekf: Record, history: np.ndarray) -> None:
     Only TDOAs can show how large the error is.
     """
     noise.widen(ekf, WRONG_POSITION**2, SPEED**2)
+    ekf.horizon.state = OFF
     add_reset(ekf, ekf.t, history)
 
 

@@ -63,8 +63,6 @@ TDOA = _record(
     ("slope", float, N_STATES),
     ("state", float, N_STATES),  # linearization point of the bias, m and m/s
     ("pose", float, 3),  # on the path of wheels, m and rad, see velocity.py; the filter sets it
-    ("smoothed", bool),  # the TDOA is linearized at a position of a smoothed path
-    ("position", float, 3),  # m, world frame, this position
 )
 # Measurement of a sensor, see sensors.py.
 SENSOR_ROW = _record(
@@ -207,6 +205,42 @@ YAW_TEST = _record(
     ("opened", float),  # s, stamp of the last time
 )
 
+# Moving horizon estimate, see horizon.py: whether it runs, or the filter has just started; number of
+# its models, and most TDOAs in its window.
+OFF, STARTED, RUNNING = range(3)
+MODELS, ROOM = (7, 48)
+LINEARIZATION = _record(("p", float, 3), ("weight", float))  # m, world frame; robust weight
+MODEL = _record(
+    # state before the window, [position, velocity], m and m/s, with its stamp in s, and at its end
+    ("t", float),
+    ("x", float, 6),
+    ("P", float, (6, 6)),
+    ("end", float, 6),
+    ("end_P", float, (6, 6)),
+    ("std", float),  # m, noise of a TDOA
+    ("at", LINEARIZATION, ROOM),
+)
+# scalar update: Jacobian, gain, innovation in m and its variance in m^2; 0: there was none
+UPDATE = _record(
+    ("jacobian", float, 6), ("gain", float, 6), ("innovation", float), ("variance", float)
+)
+STEP = _record(
+    # share of the velocity that is left after the prediction, and the time, s, over which it counts
+    ("kept", float),
+    ("way", float),
+    ("x", float, 6),  # state and covariance before the update with the TDOA
+    ("P", float, (6, 6)),
+    ("bounds", UPDATE, 3),  # by the workspace, before it
+    ("tdoa", UPDATE),
+    ("unweighted", float),  # m^2, variance of the innovation without the robust weight
+)
+HORIZON = _record(
+    ("state", int),
+    ("count", int),
+    ("models", MODEL, MODELS),
+    ("steps", STEP, ROOM),  # steps: scratch
+)
+
 # State of the filter, except its anchors.
 EKF = _record(
     ("t", float),  # s, stamp of the hypotheses
@@ -287,6 +321,7 @@ EKF = _record(
     ("next_odometry", float),  # s, stamp of the next odometry
     ("next_rest", float),  # s, stamp of the next zero-velocity update
     ("next_merge", float),  # s, stamp of the next merge of hypotheses
+    ("horizon", HORIZON),
     ("kept", int),  # number of TDOAs in the window
     ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
     ("recorded", int),  # number of records written to the history, see history.py

@@ -323,12 +323,17 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
     bool
         Whether the hypothesis was updated.
     """
-    x = hypothesis.x[axis]
-    nearest = min(max(x, bounds[0, axis]), bounds[1, axis])
-    std = STD + (abs(x - nearest) if axis < 2 else 0.0)
-    if x == nearest:
-        nearest, std = 0.5 * (bounds[0, axis] + bounds[1, axis]), bounds[1, axis] - bounds[0, axis]
+    place, std = prior_of(bounds, hypothesis.x, axis)
     if hypothesis.P[axis, axis] <= std**2:
         return False
-    kalman_direct(hypothesis, innovation, axis, nearest, std)
+    kalman_direct(hypothesis, innovation, axis, place, std)
     return True
+
+
+@compiled
+def prior_of(bounds: np.ndarray, x: np.ndarray, axis: int) -> tuple[float, float]:
+    """Return mean and standard deviation, m, of the prior that `constrain` applies at x (3,) or longer."""
+    nearest = min(max(x[axis], bounds[0, axis]), bounds[1, axis])
+    if x[axis] == nearest:
+        return 0.5 * (bounds[0, axis] + bounds[1, axis]), bounds[1, axis] - bounds[0, axis]
+    return nearest, STD + (abs(x[axis] - nearest) if axis < 2 else 0.0)

@@ -1,0 +1,459 @@
+# Copyright uwb_tdoa maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Moving horizon estimate of a tag that sends few TDOAs and has no other sensor.
+
+Between two TDOAs such a tag moves by metres. A TDOA is not linear over such a distance, so an update
+of a prediction is often wrong. The last ROOM TDOAs are therefore linearized again with each new TDOA,
+on the path that they determine together (Rao, Rawlings and Mayne, Constrained state estimation for
+nonlinear discrete-time systems: stability and moving horizon approximations, IEEE Trans. Automatic
+Control 48, 2003). The pass over the window is an iterated Kalman smoother (B. Bell, The iterated Kalman
+smoother as a Gauss-Newton method, SIAM J. Optimization 4, 1994). What earlier TDOAs determine is the
+state before the window.
+
+Several models of the motion run in parallel, from a tag at rest to a racing drone. Their estimates
+are mixed by the likelihood of recent TDOAs (multiple model estimation: Bar-Shalom et al., Estimation
+with Applications to Tracking and Navigation, 2001, section 11.6.2).
+
+`smooth` runs the same models over a whole recording.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.geometry import linearized_tdoa
+
+from . import hypotheses
+from .ground import SPEED
+from .initialization import last_few, recent
+from .memory import HYPOTHESES, LINEARIZATION, MODEL, MODELS, ODOMETRY, OFF, ROOM, RUNNING, STEP
+from .workspace import prior_of
+
+# random acceleration of each model, as a share of motion_noise: from a racing drone to a tag at rest
+SHARES = np.array([4.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.01])
+# s after which a velocity has faded to 1/e without measurements: no tag accelerates without end
+FADING = 6.0
+MEMORY = 5.0  # s of TDOAs that decide between the models
+# TDOAs in the last second below which the horizon begins, and above which it ends
+BEGINS, ENDS = (30, 45)
+ALONE = 5.0  # s without another sensor after which a tag counts as alone
+# passes over the window with a new TDOA, at the begin, and over a recording
+PASSES, FIRST, ALL = (2, 10, 15)
+BEND = 4.0  # standard deviations at which the Huber weight bends
+LARGEST_NIS = 25.0  # normalized innovation squared; limits the effect of an outlier on the choice
+# Noise of a model: number of TDOAs for which tdoa_std counts, share of a new value, largest
+# normalized innovation squared, least standard deviation in m.
+PRIOR_TDOAS, NEW, LARGEST_FIT, LEAST_STD = (4.0, 0.2, 9.0, 0.02)
+
+
+@compiled
+def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
+    """Set the filter to the estimate of the horizon, after an update with the newest TDOA.
+
+    Nothing happens if the tag is not alone, rests, or sends many TDOAs.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    """
+    horizon, best, passes = ekf.horizon, ekf.hypotheses[ekf.best], PASSES
+    most = ENDS if horizon.state == RUNNING else BEGINS
+    if (
+        not (parameters.adapt_noise and parameters.recover)
+        or ekf.resting
+        or not _is_alone(ekf, parameters, t)
+        or len(recent(ekf, 1.0)) > most
+    ):
+        horizon.state = OFF
+        return
+    if horizon.state == OFF:
+        _begin(horizon, parameters, t, best.x[:6], best.P[:6, :6])
+        horizon.state = RUNNING
+        return
+    if horizon.state == RUNNING:
+        _add(ekf, anchors, parameters)
+    else:
+        _begin_anew(ekf, parameters)
+        passes = FIRST
+    horizon.state = RUNNING
+    n, scores = horizon.count, np.empty(MODELS)
+    window, steps = ekf.window[ekf.kept - n : ekf.kept], horizon.steps[:n]
+    no_rows = np.empty(0, ODOMETRY)
+    for m in range(MODELS):
+        model, psd = horizon.models[m], (SHARES[m] * parameters.motion_noise) ** 2
+        at = model.at[:n]
+        for _ in range(passes):
+            _forward(model, window, anchors, psd, ekf.workspace, at, steps)
+            _backward(steps, at, no_rows)
+            _weigh(model.std, window, anchors, at)
+        scores[m], fit = _judge(window, steps)
+        _learn_noise(model, n, fit, parameters.tdoa_std)
+    _mix(ekf, scores)
+
+
+@compiled
+def _is_alone(ekf: Record, parameters: Record, t: float) -> bool:
+    """Return whether no other sensor than TDOAs is used, and none was heard in the last ALONE s."""
+    since = max(ekf.velocity.heard, ekf.height.heard, ekf.barometer.heard, ekf.ranged[0].t)
+    if parameters.use_imu:
+        since = max(since, ekf.imu.t)
+    return t - since > ALONE and parameters.fixed_height_std == 0.0 and not parameters.planar
+
+
+@compiled
+def _begin(
+    horizon: Record, parameters: Record, t: float, x: np.ndarray, covariance: np.ndarray
+) -> None:
+    """Begin without TDOAs, at a state x (6,) and its covariance (6, 6) at stamp t (s)."""
+    horizon.count = 0
+    for m in range(MODELS):
+        model = horizon.models[m]
+        model.t, model.std = t, parameters.tdoa_std
+        model.x[:], model.end[:] = x, x
+        model.P[:, :] = covariance
+
+
+@compiled
+def _begin_anew(ekf: Record, parameters: Record) -> None:
+    """Begin with the TDOAs of a start, anywhere in the workspace, linearized at the start position."""
+    window, horizon = last_few(ekf), ekf.horizon
+    n = min(len(window), ROOM)
+    x, covariance = np.zeros(6), np.zeros((6, 6))
+    anywhere(ekf.workspace, x, covariance)
+    _begin(horizon, parameters, window[len(window) - n].t, x, covariance)
+    horizon.count = n
+    for m in range(MODELS):
+        for k in range(n):
+            place = horizon.models[m].at[k]
+            place.weight = 1.0
+            place.p[:] = ekf.hypotheses[ekf.best].x[:3]
+
+
+@compiled
+def anywhere(workspace: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> None:
+    """Fill in the state x (6,) and covariance (6, 6) of a tag anywhere in its workspace (2, 3), m."""
+    for k in range(3):
+        x[k] = 0.5 * (workspace[0, k] + workspace[1, k])
+        covariance[k, k] = (0.5 * (workspace[1, k] - workspace[0, k])) ** 2
+        covariance[3 + k, 3 + k] = SPEED**2
+
+
+@compiled
+def _add(ekf: Record, anchors: np.ndarray, parameters: Record) -> None:
+    """Add the newest TDOA to the window; the oldest one moves into the state before the window."""
+    horizon, n = ekf.horizon, ekf.horizon.count
+    newest, full = ekf.window[ekf.kept - 1], n == ROOM
+    for m in range(MODELS):
+        model = horizon.models[m]
+        dt = newest.t - (ekf.window[ekf.kept - 2].t if n > 0 else model.t)
+        p = model.end[:3] + dt * model.end[3:]
+        if full:
+            psd = (SHARES[m] * parameters.motion_noise) ** 2
+            oldest = ekf.window[ekf.kept - 1 - n : ekf.kept - n]
+            _forward(model, oldest, anchors, psd, ekf.workspace, model.at, horizon.steps)
+            model.t, model.x[:] = oldest[0].t, model.end
+            model.P[:, :] = model.end_P
+            for k in range(ROOM - 1):
+                model.at[k] = model.at[k + 1]
+        place = model.at[ROOM - 1 if full else n]
+        place.weight, place.p[:] = 1.0, p
+    horizon.count = n if full else n + 1
+
+
+@compiled
+def _forward(
+    model: Record,
+    window: np.ndarray,
+    anchors: np.ndarray,
+    psd: float,
+    bounds: np.ndarray,
+    at: np.ndarray,
+    steps: np.ndarray,
+) -> None:
+    """Run the Kalman filter of a model over a window; its state at the end becomes model.end.
+
+    Parameters
+    ----------
+    model : MODEL
+        State before the window, and noise.
+    window : (n,) TDOA
+        TDOAs, by rising stamp.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    psd : float
+        Power of the random acceleration, m^2/s^3.
+    bounds : (2, 3) array
+        Workspace, m, world frame.
+    at : (n,) LINEARIZATION
+        Where each TDOA is linearized, and its robust weight.
+    steps : (n,) STEP
+        Filled.
+    """
+    x, P, t = model.end, model.end_P, model.t
+    x[:] = model.x
+    P[:, :] = model.P
+    for i in range(len(window)):
+        tdoa, one = window[i], steps[i]
+        a, b, update, p = anchors[tdoa.a], anchors[tdoa.b], one.tdoa, at[i].p
+        _predict(x, P, tdoa.t - t, psd, one)
+        t = tdoa.t
+        for k in range(3):
+            _bound(x, P, bounds, k, one.bounds[k])
+        one.x[:] = x
+        one.P[:, :] = P
+        row = update.jacobian
+        update.innovation = tdoa.d - linearized_tdoa(p, a.position, b.position, row)
+        row[3:] = 0.0
+        for k in range(3):
+            update.innovation -= row[k] * (x[k] - p[k])
+        noise = model.std**2 + tdoa.variance + a.delay_variance + b.delay_variance
+        noise += a.excess_variance + b.excess_variance
+        one.unweighted = noise - noise / at[i].weight
+        _update(x, P, noise / at[i].weight, update)
+        one.unweighted += update.variance
+
+
+@compiled
+def _update(x: np.ndarray, P: np.ndarray, noise: float, update: Record) -> None:
+    """Update a state x (6,) and covariance P (6, 6) with an UPDATE; gain and variance are filled in.
+
+    noise is the variance of the measurement, m^2.
+    """
+    row, gain, update.variance = update.jacobian, update.gain, noise
+    for j in range(6):
+        gain[j] = P[j, 0] * row[0] + P[j, 1] * row[1] + P[j, 2] * row[2]
+    for k in range(3):
+        update.variance += row[k] * gain[k]
+    for j in range(6):
+        gain[j] /= update.variance
+    for j in range(6):
+        x[j] += gain[j] * update.innovation
+        for k in range(6):
+            P[j, k] -= gain[j] * gain[k] * update.variance
+
+
+@compiled
+def _predict(x: np.ndarray, P: np.ndarray, dt: float, psd: float, one: Record) -> None:
+    """Predict a state x (6,) and covariance P (6, 6) over dt (s) with a velocity that fades.
+
+    It is driven by white acceleration of power psd, m^2/s^3. The transition is stored in a STEP.
+    """
+    kept = math.exp(-dt / FADING)
+    way = FADING * (1.0 - kept)
+    one.kept, one.way = kept, way
+    for k in range(3):
+        x[k] += way * x[3 + k]
+        x[3 + k] *= kept
+        for j in range(6):
+            P[k, j] += way * P[3 + k, j]
+            P[3 + k, j] *= kept
+    for k in range(3):
+        for j in range(6):
+            P[j, k] += way * P[j, 3 + k]
+            P[j, 3 + k] *= kept
+    for k in range(3):
+        P[k, k] += psd * dt**3 / 3.0
+        P[k, 3 + k] += psd * dt**2 / 2.0
+        P[3 + k, k] += psd * dt**2 / 2.0
+        P[3 + k, 3 + k] += psd * dt
+
+
+@compiled
+def _bound(x: np.ndarray, P: np.ndarray, bounds: np.ndarray, axis: int, update: Record) -> None:
+    """Apply the prior of the workspace to x (6,) and P (6, 6), as `workspace.constrain` does."""
+    place, std = prior_of(bounds, x, axis)
+    update.variance = 0.0
+    if P[axis, axis] > std**2:
+        update.jacobian[:] = 0.0
+        update.jacobian[axis], update.innovation = 1.0, place - x[axis]
+        _update(x, P, std**2, update)
+
+
+@compiled
+def _backward(steps: np.ndarray, at: np.ndarray, rows: np.ndarray) -> tuple[float, float]:
+    """Linearize at the smoothed path, by the modified Bryson-Frazier recursion of smoother.py.
+
+    Parameters
+    ----------
+    steps : (n,) STEP
+        From `_forward`.
+    at : (n,) LINEARIZATION
+        The positions are replaced.
+    rows : (n,) ODOMETRY
+        Position, velocity and their covariance are filled in. Empty: no covariance is computed.
+
+    Returns
+    -------
+    tuple
+        Minus the log likelihood of each TDOA given all others, and the mean of the normalized
+            squared residual; 0 without rows.
+    """
+    adjoint, information = np.zeros(6), np.zeros((6, 6))
+    scratch, loss, fit = np.zeros(6), 0.0, 0.0
+    whole = len(rows) > 0
+    for i in range(len(steps) - 1, -1, -1):
+        one = steps[i]
+        factor, of_information = _through_update(one.tdoa, adjoint, information, whole, scratch)
+        for k in range(3):
+            p = one.x[k]
+            for j in range(6):
+                p -= one.P[k, j] * adjoint[j]
+            at[i].p[k] = p
+        if whole:
+            nis = factor**2 / of_information
+            loss += 0.5 * (min(nis, LARGEST_NIS) - math.log(of_information))
+            fit += min(nis, LARGEST_FIT) / len(steps)
+            rows[i].x[:6] = one.x - np.sum(one.P * adjoint, axis=1)
+            for j in range(6):
+                scratch[:] = np.sum(information * one.P[j], axis=1)
+                for k in range(6):
+                    rows[i].covariance[j, k] = one.P[j, k] - np.sum(one.P[k] * scratch)
+        for k in range(2, -1, -1):
+            if one.bounds[k].variance > 0.0:
+                _through_update(one.bounds[k], adjoint, information, whole, scratch)
+        for k in range(3):  # Phi' adjoint and Phi' information Phi
+            adjoint[3 + k] = one.way * adjoint[k] + one.kept * adjoint[3 + k]
+        if whole:
+            information[3:] = one.way * information[:3] + one.kept * information[3:]
+            information[:, 3:] = one.way * information[:, :3] + one.kept * information[:, 3:]
+    return loss, fit
+
+
+@compiled
+def _through_update(
+    update: Record, adjoint: np.ndarray, information: np.ndarray, whole: bool, scratch: np.ndarray
+) -> tuple[float, float]:
+    """Step adjoint (6,) and, if `whole`, information (6, 6) backwards through an UPDATE.
+
+    The equations are in `smoother._through_update`. Return the residual of the measurement to the
+    estimate by all others, and its variance, each over the variance: u and M.
+    """
+    row, gain = update.jacobian, update.gain
+    u, M = update.innovation / update.variance, 1.0 / update.variance
+    for j in range(6):
+        u += gain[j] * adjoint[j]
+    for k in range(3):
+        adjoint[k] -= u * row[k]
+    if whole:
+        scratch[:] = np.sum(information * gain, axis=1)
+        M += np.sum(gain * scratch)
+        for j in range(6):
+            for k in range(6):
+                information[j, k] += M * row[j] * row[k] - row[j] * scratch[k] - scratch[j] * row[k]
+    return u, M
+
+
+@compiled
+def _weigh(std: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) -> None:
+    """Set the Huber weight of each TDOA by its residual to the path; std is its noise, m."""
+    row = np.empty(3)
+    for i in range(len(window)):
+        a, b = anchors[window[i].a].position, anchors[window[i].b].position
+        off = abs(window[i].d - linearized_tdoa(at[i].p, a, b, row))
+        at[i].weight = min(1.0, BEND * std / max(off, 1e-9))
+
+
+@compiled
+def _judge(window: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
+    """Return log likelihood of recent innovations, and the mean normalized innovation squared."""
+    score, fit, n = 0.0, 0.0, len(window)
+    for i in range(n):
+        one = steps[i]
+        nis = min(one.tdoa.innovation**2 / one.unweighted, LARGEST_NIS)
+        recency = math.exp((window[i].t - window[n - 1].t) / MEMORY)
+        score -= 0.5 * recency * (nis + math.log(one.unweighted))
+        fit += min(nis, LARGEST_FIT) / n
+    return score, fit
+
+
+@compiled
+def _learn_noise(model: Record, n: int, fit: float, prior: float) -> None:
+    """Update the noise of a MODEL by the mean normalized innovation squared of n TDOAs.
+
+    The prior tdoa_std (m) is also the largest value: `noise.learn` adds what an anchor has beyond it.
+    """
+    found = (PRIOR_TDOAS * prior**2 + n * model.std**2 * fit) / (PRIOR_TDOAS + n)
+    std = math.sqrt((1.0 - NEW) * model.std**2 + NEW * found)
+    model.std = min(max(std, LEAST_STD), prior)
+
+
+@compiled
+def _mix(ekf: Record, scores: np.ndarray) -> None:
+    """Set all hypotheses to the mean of the models, weighted by exp(scores), (MODELS,)."""
+    weights = np.exp(scores - np.max(scores))
+    weights /= np.sum(weights)
+    x, covariance, power = np.zeros(6), np.zeros((6, 6)), 0.0
+    for m in range(MODELS):
+        x += weights[m] * ekf.horizon.models[m].end
+        power += weights[m] * SHARES[m] ** 2
+    for m in range(MODELS):
+        model = ekf.horizon.models[m]
+        apart = model.end - x
+        covariance += weights[m] * (model.end_P + np.outer(apart, apart))
+    ekf.motion_ratio = power
+    for h in range(HYPOTHESES):
+        if hypotheses.alive(ekf.hypotheses[h]):
+            hypotheses.set_state(ekf.hypotheses[h], x, covariance)
+
+
+@compiled
+def smooth(
+    tdoas: np.ndarray,
+    anchors: np.ndarray,
+    parameters: np.ndarray,
+    bounds: np.ndarray,
+    begin: np.ndarray,
+) -> np.ndarray:
+    """Return smoothed estimates (n,) of ODOMETRY at the stamps of all TDOAs of a tag alone.
+
+    Parameters
+    ----------
+    tdoas : (n,) TDOA
+        Corrected TDOAs, by rising stamp.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : (1,) PARAMETERS
+        Tuning of the filter.
+    bounds : (2, 3) array
+        Workspace, m, world frame.
+    begin : (n, 3) array
+        Positions on which the TDOAs are linearized first, m, world frame.
+    """
+    n, prior = len(tdoas), parameters[0].tdoa_std
+    steps, at = np.empty(n, STEP), np.empty(n, LINEARIZATION)
+    models, rows = np.zeros(MODELS, MODEL), np.zeros((MODELS, n), ODOMETRY)
+    losses = np.empty(MODELS)
+    for m in range(MODELS):
+        model, psd, fit = models[m], (SHARES[m] * parameters[0].motion_noise) ** 2, 1.0
+        model.t, model.std = tdoas[0].t, prior
+        anywhere(bounds, model.x, model.P)
+        for i in range(n):
+            at[i].weight, at[i].p[:] = 1.0, begin[i]
+        for _ in range(ALL):
+            _forward(model, tdoas, anchors, psd, bounds, at, steps)
+            losses[m], fit = _backward(steps, at, rows[m])
+            _weigh(model.std, tdoas, anchors, at)
+            _learn_noise(model, n, fit, prior)
+    weights = np.exp(np.min(losses) - losses)
+    weights /= np.sum(weights)
+    out = np.zeros(n, ODOMETRY)
+    for i in range(n):
+        out[i].t = tdoas[i].t
+        for m in range(MODELS):
+            out[i].x[:6] += weights[m] * rows[m, i].x[:6]
+        for m in range(MODELS):
+            apart = rows[m, i].x[:6] - out[i].x[:6]
+            out[i].covariance[:6, :6] += weights[m] * (
+                rows[m, i].covariance[:6, :6] + np.outer(apart, apart)
+            )
+    return out
