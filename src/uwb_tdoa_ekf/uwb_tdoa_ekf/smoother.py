@@ -42,6 +42,8 @@ RANGE = "range"
 LAGS = 64  # most ranges of one anchor over which their errors are compared
 FEWEST_RANGES = 4 * LAGS  # of one anchor; fewer show no correlation
 OUTLIER = 3.0  # standard deviations to which a residual is limited
+# extent of anchors along their normal, over the next larger one, below which they lie near a plane
+FLAT = 0.2
 ANY_DISTANCE = 1000.0  # m, and s: longer than errors of ranges stay alike
 
 
@@ -159,9 +161,10 @@ def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector |
     path = run.odometry
     begin = np.stack([np.interp(tdoas["t"], path.t, axis) for axis in path.p.T], axis=1)
     state = new_state(flight.anchors.positions)
+    begins = [begin, *_on_both_sides(begin, flight.anchors.positions)]
     bounds = np.empty((2, 3))
     workspace.set_bounds(state.record.extent, config.workspace_margin, bounds)
-    rows = horizon.smooth(tdoas, state.anchors, config.parameters(), bounds, begin)
+    rows = horizon.smooth(tdoas, state.anchors, config.parameters(), bounds, np.array(begins))
     number = np.floor(rows["t"] * config.odometry_rate)
     rows = rows[np.append(number[1:] != number[:-1], True)]
     last = np.maximum(np.searchsorted(path.t, rows["t"], side="right") - 1, 0)
@@ -169,6 +172,20 @@ def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector |
     rows["covariance"][:, 6:, 6:] = path.covariance[last, 6:, 6:]
     rows["rate"], rows["rate_variance"] = path.rate[last], path.rate_variance[last]
     return replace(run, odometry=_with_persistent(Odometry.from_rows(rows), path))
+
+
+def _on_both_sides(path: np.ndarray, anchors: np.ndarray) -> list[np.ndarray]:
+    """Return a path (n, 3), m, reflected to either side of anchors (N, 3) that lie near a plane.
+
+    TDOAs of such anchors hardly distinguish the sides, so a path may cross to the wrong side. Other
+    anchors give no path.
+    """
+    middle = anchors.mean(axis=0)
+    _, extents, axes = np.linalg.svd(anchors - middle, full_matrices=False)
+    if len(extents) < 3 or extents[2] > FLAT * extents[1]:
+        return []
+    height = ((path - middle) @ axes[2])[:, None]
+    return [path + (sign * np.abs(height) - height) * axes[2] for sign in (-1.0, 1.0)]
 
 
 def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:

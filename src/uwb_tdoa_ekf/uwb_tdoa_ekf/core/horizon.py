@@ -25,6 +25,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
+from uwb_tdoa_bias.common.robust_loss import CAUCHY, weight
 
 from . import hypotheses
 from .ground import SPEED
@@ -42,8 +43,8 @@ BEGINS, ENDS = (30, 45)
 ALONE = 5.0  # s without another sensor after which a tag counts as alone
 # passes over the window with a new TDOA, at the begin, and over a recording
 PASSES, FIRST, ALL = (2, 10, 15)
-BEND = 4.0  # standard deviations at which the Huber weight bends
-LARGEST_NIS = 25.0  # normalized innovation squared; limits the effect of an outlier on the choice
+BEND = 4.0  # standard deviations at which the Cauchy loss bends
+LARGEST_NIS = 9.0  # normalized innovation squared; limits the effect of an outlier on the choice
 # Noise of a model: number of TDOAs for which tdoa_std counts, share of a new value, largest
 # normalized innovation squared, least standard deviation in m.
 PRIOR_TDOAS, NEW, LARGEST_FIT, LEAST_STD = (4.0, 0.2, 9.0, 0.02)
@@ -96,6 +97,10 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
             _forward(model, window, anchors, psd, ekf.workspace, at, steps)
             _backward(steps, at, no_rows)
             _weigh(model.std, window, anchors, at)
+            # an outlier moves the end of the path, so the residual to the path does not show it
+            last, scale = steps[n - 1], BEND * math.sqrt(steps[n - 1].unweighted)
+            by_innovation = weight(CAUCHY, last.tdoa.innovation, scale)
+            at[n - 1].weight = min(at[n - 1].weight, by_innovation)
         scores[m], fit = _judge(window, steps)
         _learn_noise(model, n, fit, parameters.tdoa_std)
     _mix(ekf, scores)
@@ -355,12 +360,12 @@ def _through_update(
 
 @compiled
 def _weigh(std: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) -> None:
-    """Set the Huber weight of each TDOA by its residual to the path; std is its noise, m."""
+    """Set the robust weight of each TDOA by its residual to the path; std is its noise, m."""
     row = np.empty(3)
     for i in range(len(window)):
         a, b = anchors[window[i].a].position, anchors[window[i].b].position
-        off = abs(window[i].d - linearized_tdoa(at[i].p, a, b, row))
-        at[i].weight = min(1.0, BEND * std / max(off, 1e-9))
+        off = window[i].d - linearized_tdoa(at[i].p, a, b, row)
+        at[i].weight = weight(CAUCHY, off, BEND * std)
 
 
 @compiled
@@ -412,7 +417,7 @@ def smooth(
     anchors: np.ndarray,
     parameters: np.ndarray,
     bounds: np.ndarray,
-    begin: np.ndarray,
+    begins: np.ndarray,
 ) -> np.ndarray:
     """Return smoothed estimates (n,) of ODOMETRY at the stamps of all TDOAs of a tag alone.
 
@@ -426,19 +431,19 @@ def smooth(
         Tuning of the filter.
     bounds : (2, 3) array
         Workspace, m, world frame.
-    begin : (n, 3) array
-        Positions on which the TDOAs are linearized first, m, world frame.
+    begins : (k, n, 3) array
+        Paths on which the TDOAs are linearized first, m, world frame. The result is a mean of the
+        paths to which they lead, weighted by their likelihood.
     """
-    n, prior = len(tdoas), parameters[0].tdoa_std
+    n, prior, count = len(tdoas), parameters[0].tdoa_std, len(begins) * MODELS
     steps, at = np.empty(n, STEP), np.empty(n, LINEARIZATION)
-    models, rows = np.zeros(MODELS, MODEL), np.zeros((MODELS, n), ODOMETRY)
-    losses = np.empty(MODELS)
-    for m in range(MODELS):
-        model, psd, fit = models[m], (SHARES[m] * parameters[0].motion_noise) ** 2, 1.0
+    models, rows, losses = np.zeros(count, MODEL), np.zeros((count, n), ODOMETRY), np.empty(count)
+    for m in range(count):
+        model, psd = models[m], (SHARES[m % MODELS] * parameters[0].motion_noise) ** 2
         model.t, model.std = tdoas[0].t, prior
         anywhere(bounds, model.x, model.P)
         for i in range(n):
-            at[i].weight, at[i].p[:] = 1.0, begin[i]
+            at[i].weight, at[i].p[:] = 1.0, begins[m // MODELS, i]
         for _ in range(ALL):
             _forward(model, tdoas, anchors, psd, bounds, at, steps)
             losses[m], fit = _backward(steps, at, rows[m])
@@ -449,11 +454,10 @@ def smooth(
     out = np.zeros(n, ODOMETRY)
     for i in range(n):
         out[i].t = tdoas[i].t
-        for m in range(MODELS):
+        for m in range(count):
             out[i].x[:6] += weights[m] * rows[m, i].x[:6]
-        for m in range(MODELS):
+        for m in range(count):
             apart = rows[m, i].x[:6] - out[i].x[:6]
-            out[i].covariance[:6, :6] += weights[m] * (
-                rows[m, i].covariance[:6, :6] + np.outer(apart, apart)
-            )
+            covariance = rows[m, i].covariance[:6, :6] + np.outer(apart, apart)
+            out[i].covariance[:6, :6] += 0.5 * weights[m] * (covariance + covariance.T)
     return out
