@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors.velocity import Velocity
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
@@ -40,12 +41,16 @@ GRAVITY = np.array([0.0, 0.0, 9.81])
 
 @dataclass(frozen=True)
 class Body:
-    """Lissajous figure of a tag: half axes (m), speed (m/s), height of steps (m), thrust tilts it."""
+    """Lissajous figure of a tag: half axes (m), speed (m/s), height of steps (m).
+
+    tilts : thrust tilts it. holds : it stands still for half of each period (s).
+    """
 
     reach: tuple[float, float, float]
     speed: float
     bob: float = 0.0
     tilts: bool = False
+    holds: float = 0.0
 
 
 BODIES = {
@@ -56,11 +61,17 @@ BODIES = {
     "quadrotor": Body((2.0, 2.0, 0.6), 1.0, tilts=True),
     "racing": Body((3.5, 3.5, 0.5), 8.0, tilts=True),
     "lift": Body((0.3, 0.3, 1.0), 0.5),
+    "arm": Body((0.8, 0.8, 0.5), 0.8, holds=6.0),
+    "forklift": Body((17.0, 12.0, 0.0), 2.5),
+    "train": Body((28.0, 0.8, 0.0), 3.0),
 }
 # errors of anchors; and anchors on one line that is no axis, anchors of the ceiling alone, rates beyond
 # the range of the gyroscope, a height that is not fixed
 ERRORS = "white", "delays", "survey", "reflections"
 LINE, CEILING, CLIPPED, FIXED = "oblique line", "ceiling", "clipped gyroscope", "fixed height"
+# anchors of a hall of 40 x 30 m and of a tunnel of 60 x 4 m, of which the tag hears the nearest eight;
+# wheels that measure velocity and yaw rate
+HALL, TUNNEL, WHEELS = "hall", "tunnel", "wheels"
 SHARE = 0.023  # of the samples of a gyroscope, beyond its range
 CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("rest", 0, 1, "white"),
@@ -106,6 +117,17 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("quadrotor", 500, 50, LINE),
     ("racing", 500, 200, CLIPPED),
     ("lift", 100, 50, FIXED),
+    ("forklift", 0, 2, HALL),
+    ("forklift", 0, 10, HALL),
+    ("forklift", 100, 20, HALL),
+    ("train", 0, 10, TUNNEL),
+    ("train", 100, 50, TUNNEL),
+    ("arm", 0, 10, "white"),
+    ("arm", 0, 20, "delays"),
+    ("arm", 100, 50, "delays"),
+    ("rover", 0, 2, WHEELS),
+    ("rover", 0, 10, WHEELS),
+    ("rover", 100, 50, WHEELS),
 ]
 
 
@@ -120,13 +142,17 @@ def simulate(
     rates = body.speed / math.sqrt(0.5 * np.sum((reach * ratio) ** 2)) * ratio
     since = np.clip(t / BEGIN, 0.0, 1.0)  # from rest to full speed over BEGIN
     way = np.where(t < BEGIN, BEGIN * (since**3 - 0.5 * since**4), t - 0.5 * BEGIN)
+    if body.holds:
+        number, share = np.divmod(t / body.holds, 1.0)
+        moves = np.minimum(2.0 * share, 1.0)
+        way = 0.5 * body.holds * (number + moves**3 * (10.0 - 15.0 * moves + 6.0 * moves**2))
     p = [0.0, 0.0, 1.2] + reach * np.sin(way[:, None] * rates + phase)
     p[:, 2] += body.bob * np.sin(2.0 * np.pi * 1.9 * t)
     path = make_interp_spline(t, p, k=5)
     v, a = path(t, 1), path(t, 2)
     yaw = (
         np.unwrap(np.arctan2(v[:, 1], v[:, 0]))
-        if body.speed and not body.tilts
+        if body.speed and not (body.tilts or body.holds)
         else np.full(len(t), phase[0])
     )
     up = (a if body.tilts else 0.0 * a) + GRAVITY
@@ -139,15 +165,28 @@ def simulate(
         places[:4] = [(4.0, 0.0, 2.6), (0.0, 4.0, 2.6), (-4.0, 0.0, 2.6), (0.0, -4.0, 2.6)]
     if errors == LINE:
         places = np.linspace((-4.0, -2.4, 2.8), (4.0, 2.4, 2.8), 8)
-    surveyed = places + SURVEY * (errors == "survey") * rng.normal(size=(8, 3))
-    anchors = Anchors(np.arange(8), surveyed, np.tile([0.0, 0.0, 0.0, 1.0], (8, 1)))
-    return Flight(
+    if errors in (HALL, TUNNEL):
+        x, y = (
+            ([-20, -10, 0, 10, 20], [-15, -5, 5, 15])
+            if errors == HALL
+            else (range(-30, 31, 6), [-2, 2])
+        )
+        places = np.array(
+            [(i, j, (0.5, 4.0)[(m + n) % 2]) for m, i in enumerate(x) for n, j in enumerate(y)]
+        )
+    count = len(places)
+    surveyed = places + SURVEY * (errors == "survey") * rng.normal(size=(count, 3))
+    anchors = Anchors(np.arange(count), surveyed, np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)))
+    flight = Flight(
         name,
         anchors,
         _tdoas(path, places, rate, errors, rng),
         _imu(t, a, q, imu_rate, errors == CLIPPED, rng) if imu_rate else None,
         Truth(t[::10], p[::10], q.as_quat()[::10]),
-    ), float(np.mean(np.sum((v[500:] - v[:-500]) ** 2, axis=1)) / 1.5)
+    )
+    if errors == WHEELS:
+        flight = flight.replaced(velocity=_wheels(t[::50], v[::50], q[::50], rng))
+    return flight, float(np.mean(np.sum((v[500:] - v[:-500]) ** 2, axis=1)) / 1.5)
 
 
 def _tdoas(path: Any, places: np.ndarray, rate: float, errors: str, rng: Any) -> Tdoas:
@@ -155,7 +194,10 @@ def _tdoas(path: Any, places: np.ndarray, rate: float, errors: str, rng: Any) ->
     t = np.arange(0.01, DURATION, 1.0 / rate)
     a = rng.integers(0, 8, len(t))
     b = (a + rng.integers(1, 8, len(t))) % 8
-    p, each = path(t), DELAY * (errors == "delays") * rng.normal(size=8)
+    p, each = path(t), DELAY * (errors == "delays") * rng.normal(size=len(places))
+    nearest = np.argsort(np.linalg.norm(p[:, None] - places, axis=2), axis=1)
+    if len(places) > 8:
+        a, b = nearest[range(len(t)), a], nearest[range(len(t)), b]
     arrival = np.linalg.norm(p[:, None] - places, axis=2) + each
     if errors == "reflections":
         waves, phases = (
@@ -167,6 +209,15 @@ def _tdoas(path: Any, places: np.ndarray, rate: float, errors: str, rng: Any) ->
         )
     rows = np.arange(len(t))
     return Tdoas(t, a, b, arrival[rows, b] - arrival[rows, a] + NOISE * rng.normal(size=len(t)))
+
+
+def _wheels(t: np.ndarray, v: np.ndarray, q: Rotation, rng: Any) -> Velocity:
+    """Return velocities in the body frame and yaw rates, as wheels measure them, with stated noise."""
+    n, yaw = len(t), np.unwrap(q.as_euler("ZYX")[:, 0])
+    of_body = q.inv().apply(v) + [0.02, 0.0, 0.0] * rng.normal(size=(n, 1))
+    std = np.tile([0.02, 0.02, np.inf], (n, 1))
+    rate = np.gradient(yaw, t) + 0.02 * rng.normal(size=n)
+    return Velocity(t, of_body * [1.0, 0.0, 0.0], std, rate, np.full(n, 0.02))
 
 
 def _imu(t: np.ndarray, a: np.ndarray, q: Rotation, rate: float, clipped: bool, rng: Any) -> Imu:

@@ -25,7 +25,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
-from uwb_tdoa_bias.common.robust_loss import CAUCHY, weight
+from uwb_tdoa_bias.common.robust_loss import CAUCHY, HUBER, weight
 
 from . import hypotheses
 from .ground import SPEED
@@ -33,17 +33,17 @@ from .initialization import last_few, recent
 from .memory import HYPOTHESES, LINEARIZATION, MODEL, MODELS, ODOMETRY, OFF, ROOM, RUNNING, STEP
 from .workspace import prior_of
 
-# random acceleration of each model, as a share of motion_noise: from a racing drone to a tag at rest
-SHARES = np.array([4.0, 1.0, 0.5, 0.25, 0.1, 0.03, 0.01])
-# s after which a velocity has faded to 1/e without measurements: no tag accelerates without end
-FADING = 6.0
+# Each model: random acceleration as a share of motion_noise, from a racing drone to a tag at rest, and
+# time in s after which its velocity has faded to 1/e: people turn within seconds, vehicles drive on.
+SHARES = np.array([4.0, 1.0, 0.5, 0.25, 0.25, 0.1, 0.1, 0.03, 0.01])
+FADING = np.array([6.0, 6.0, 6.0, 6.0, 60.0, 6.0, 60.0, 6.0, 6.0])
 MEMORY = 5.0  # s of TDOAs that decide between the models
 # TDOAs in the last second below which the horizon begins, and above which it ends
 BEGINS, ENDS = (30, 45)
 ALONE = 5.0  # s without another sensor after which a tag counts as alone
 # passes over the window with a new TDOA, at the begin, and over a recording
 PASSES, FIRST, ALL = (2, 10, 15)
-BEND = 4.0  # standard deviations at which the Cauchy loss bends
+BEND = 4.0  # standard deviations at which the losses bend
 LARGEST_NIS = 9.0  # normalized innovation squared; limits the effect of an outlier on the choice
 # Noise of a model: number of TDOAs for which tdoa_std counts, share of a new value, largest
 # normalized innovation squared, least standard deviation in m.
@@ -91,10 +91,10 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
     window, steps = ekf.window[ekf.kept - n : ekf.kept], horizon.steps[:n]
     no_rows = np.empty(0, ODOMETRY)
     for m in range(MODELS):
-        model, psd = horizon.models[m], (SHARES[m] * parameters.motion_noise) ** 2
+        model, motion = horizon.models[m], _motion(m, parameters)
         at = model.at[:n]
         for _ in range(passes):
-            _forward(model, window, anchors, psd, ekf.workspace, at, steps)
+            _forward(model, window, anchors, motion, ekf.workspace, at, steps)
             _backward(steps, at, no_rows)
             _weigh(model.std, window, anchors, at)
             # an outlier moves the end of the path, so the residual to the path does not show it
@@ -103,7 +103,13 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
             at[n - 1].weight = min(at[n - 1].weight, by_innovation)
         scores[m], fit = _judge(window, steps)
         _learn_noise(model, n, fit, parameters.tdoa_std)
-    _mix(ekf, scores)
+    _mix(ekf, scores, parameters.tdoa_std)
+
+
+@compiled
+def _motion(m: int, parameters: Record) -> tuple[float, float]:
+    """Return the motion of model m, as `_forward` takes it."""
+    return (SHARES[m] * parameters.motion_noise) ** 2, FADING[m]
 
 
 @compiled
@@ -163,9 +169,9 @@ def _add(ekf: Record, anchors: np.ndarray, parameters: Record) -> None:
         dt = newest.t - (ekf.window[ekf.kept - 2].t if n > 0 else model.t)
         p = model.end[:3] + dt * model.end[3:]
         if full:
-            psd = (SHARES[m] * parameters.motion_noise) ** 2
+            motion = _motion(m, parameters)
             oldest = ekf.window[ekf.kept - 1 - n : ekf.kept - n]
-            _forward(model, oldest, anchors, psd, ekf.workspace, model.at, horizon.steps)
+            _forward(model, oldest, anchors, motion, ekf.workspace, model.at, horizon.steps)
             model.t, model.x[:] = oldest[0].t, model.end
             model.P[:, :] = model.end_P
             for k in range(ROOM - 1):
@@ -180,7 +186,7 @@ def _forward(
     model: Record,
     window: np.ndarray,
     anchors: np.ndarray,
-    psd: float,
+    motion: tuple[float, float],
     bounds: np.ndarray,
     at: np.ndarray,
     steps: np.ndarray,
@@ -195,8 +201,8 @@ def _forward(
         TDOAs, by rising stamp.
     anchors : (N,) ANCHOR
         All anchors, by row.
-    psd : float
-        Power of the random acceleration, m^2/s^3.
+    motion : tuple
+        Power of the random acceleration, m^2/s^3, and time in s in which the velocity fades.
     bounds : (2, 3) array
         Workspace, m, world frame.
     at : (n,) LINEARIZATION
@@ -210,7 +216,7 @@ def _forward(
     for i in range(len(window)):
         tdoa, one = window[i], steps[i]
         a, b, update, p = anchors[tdoa.a], anchors[tdoa.b], one.tdoa, at[i].p
-        _predict(x, P, tdoa.t - t, psd, one)
+        _predict(x, P, tdoa.t - t, motion, one)
         t = tdoa.t
         for k in range(3):
             _bound(x, P, bounds, k, one.bounds[k])
@@ -248,13 +254,17 @@ def _update(x: np.ndarray, P: np.ndarray, noise: float, update: Record) -> None:
 
 
 @compiled
-def _predict(x: np.ndarray, P: np.ndarray, dt: float, psd: float, one: Record) -> None:
+def _predict(
+    x: np.ndarray, P: np.ndarray, dt: float, motion: tuple[float, float], one: Record
+) -> None:
     """Predict a state x (6,) and covariance P (6, 6) over dt (s) with a velocity that fades.
 
-    It is driven by white acceleration of power psd, m^2/s^3. The transition is stored in a STEP.
+    White acceleration drives the velocity (an Ornstein-Uhlenbeck process). motion is as for `_forward`.
+    The transition is stored in a STEP.
     """
-    kept = math.exp(-dt / FADING)
-    way = FADING * (1.0 - kept)
+    psd, fading = motion
+    kept = math.exp(-dt / fading)
+    way = fading * (1.0 - kept)
     one.kept, one.way = kept, way
     for k in range(3):
         x[k] += way * x[3 + k]
@@ -365,7 +375,7 @@ def _weigh(std: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) 
     for i in range(len(window)):
         a, b = anchors[window[i].a].position, anchors[window[i].b].position
         off = window[i].d - linearized_tdoa(at[i].p, a, b, row)
-        at[i].weight = weight(CAUCHY, off, BEND * std)
+        at[i].weight = weight(HUBER, off, BEND * std)
 
 
 @compiled
@@ -393,19 +403,23 @@ def _learn_noise(model: Record, n: int, fit: float, prior: float) -> None:
 
 
 @compiled
-def _mix(ekf: Record, scores: np.ndarray) -> None:
-    """Set all hypotheses to the mean of the models, weighted by exp(scores), (MODELS,)."""
+def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float) -> None:
+    """Set all hypotheses to the mean of the models, weighted by exp(scores), (MODELS,).
+
+    Random acceleration and noise become their means, too; tdoa_std is in m.
+    """
     weights = np.exp(scores - np.max(scores))
     weights /= np.sum(weights)
-    x, covariance, power = np.zeros(6), np.zeros((6, 6)), 0.0
+    x, covariance, power, ratio = np.zeros(6), np.zeros((6, 6)), 0.0, 0.0
     for m in range(MODELS):
         x += weights[m] * ekf.horizon.models[m].end
         power += weights[m] * SHARES[m] ** 2
+        ratio += weights[m] * (ekf.horizon.models[m].std / tdoa_std) ** 2
     for m in range(MODELS):
         model = ekf.horizon.models[m]
         apart = model.end - x
         covariance += weights[m] * (model.end_P + np.outer(apart, apart))
-    ekf.motion_ratio = power
+    ekf.motion_ratio, ekf.noise_ratio = power, ratio
     for h in range(HYPOTHESES):
         if hypotheses.alive(ekf.hypotheses[h]):
             hypotheses.set_state(ekf.hypotheses[h], x, covariance)
@@ -439,13 +453,13 @@ def smooth(
     steps, at = np.empty(n, STEP), np.empty(n, LINEARIZATION)
     models, rows, losses = np.zeros(count, MODEL), np.zeros((count, n), ODOMETRY), np.empty(count)
     for m in range(count):
-        model, psd = models[m], (SHARES[m % MODELS] * parameters[0].motion_noise) ** 2
+        model, motion = models[m], _motion(m % MODELS, parameters[0])
         model.t, model.std = tdoas[0].t, prior
         anywhere(bounds, model.x, model.P)
         for i in range(n):
             at[i].weight, at[i].p[:] = 1.0, begins[m // MODELS, i]
         for _ in range(ALL):
-            _forward(model, tdoas, anchors, psd, bounds, at, steps)
+            _forward(model, tdoas, anchors, motion, bounds, at, steps)
             losses[m], fit = _backward(steps, at, rows[m])
             _weigh(model.std, tdoas, anchors, at)
             _learn_noise(model, n, fit, prior)

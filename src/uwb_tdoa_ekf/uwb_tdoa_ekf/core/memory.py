@@ -208,7 +208,7 @@ YAW_TEST = _record(
 # Moving horizon estimate, see horizon.py: whether it runs, or the filter has just started; number of
 # its models, and most TDOAs in its window.
 OFF, STARTED, RUNNING = range(3)
-MODELS, ROOM = (7, 48)
+MODELS, ROOM = (9, 48)
 LINEARIZATION = _record(("p", float, 3), ("weight", float))  # m, world frame; robust weight
 MODEL = _record(
     # state before the window, [position, velocity], m and m/s, with its stamp in s, and at its end
