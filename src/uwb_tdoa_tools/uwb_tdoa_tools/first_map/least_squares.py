@@ -3,8 +3,7 @@
 """Robust least squares for anchors and the path of the tag together.
 
 The unknowns are the position of the tag in each time bin, and the columns `Layout` of anchors and
-flights. Levenberg-Marquardt steps eliminate the positions, whose normal equations are banded. The search starts them from
-many points.
+flights. Levenberg-Marquardt steps solve sparse normal equations. The search starts them from many points.
 """
 
 from __future__ import annotations
@@ -14,10 +13,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
-from scipy.sparse import csr_matrix
+from scipy.sparse import csc_matrix, csr_matrix, diags
 from scipy.sparse.csgraph import shortest_path
+from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
 from .observations import STEP, Observations
@@ -54,7 +54,12 @@ class Layout:
 
 
 class Problem:
-    """Observations, and what of them a fit uses."""
+    """Observations, and what of them a fit uses.
+
+    Attributes
+    ----------
+    std : (n,) standard deviations of the residuals of a `Fit`; robust : (n,) bool, under Student's t
+    """
 
     def __init__(
         self, seen: Observations, inertial: bool = True, frame: bool = True, wide: float = 1.0
@@ -71,25 +76,33 @@ class Problem:
         self.bins = len(seen.t)
         self.two = seen.two
         self.first = np.where(self.two, seen.a, 0)
-        self.std = seen.std * wide * (LASTING if frame else 1.0)
         self.middle = seen.middle
         known = np.isfinite(seen.accel[self.middle]).all(axis=1)
         self.measured = known & inertial
         self.accel = np.where(self.measured[:, None], np.nan_to_num(seen.accel[self.middle]), 0.0)
-        self.motion_weight = np.where(self.measured, ACCEL_STD, MOTION) ** -2.0
-        self.accel_weight = np.where(self.measured, self.motion_weight, 0.0)
         self.of_flight = self.layout.of_flights[seen.flight]
         self.high = np.flatnonzero(np.isfinite(seen.height) & frame)
         ends = seen.distances[:, :2].astype(int)
         self.ends = ends[:, 0], ends[:, 1]
-        self.distance_std = seen.distances[:, 3] * wide
-        row, axis = seen.coordinates[:, :2].astype(int).T
-        self.coordinates = 3 * row + axis if frame else np.zeros(0, int)
-        self.prior = np.empty(self.layout.size)
-        self.prior[self.layout.positions] = ANYWHERE**-2.0
-        self.prior[self.layout.delays] = DELAY**-2.0
-        self.prior[self.layout.between] = max(seen.delay_std, HELD) ** -2.0
-        self.prior[5 * len(seen.ids) :] = np.tile(PER_FLIGHT**-2.0, seen.flights)
+        self.known = seen.coordinates if frame else seen.coordinates[:0]
+        row, axis = self.known[:, :2].astype(int).T
+        self.coordinates = 3 * row + axis
+        prior = np.empty(self.layout.size)
+        prior[self.layout.positions], prior[self.layout.delays] = ANYWHERE, DELAY
+        prior[self.layout.between] = max(seen.delay_std, HELD)
+        prior[5 * len(seen.ids) :] = np.tile(PER_FLIGHT, seen.flights)
+        parts = {
+            "radio": seen.std * wide * (LASTING if frame else 1.0),
+            "prior": prior,
+            "coordinate": self.known[:, 3],
+            "distance": seen.distances[:, 3] * wide,
+            "height": np.full(len(self.high), HEIGHT_STD),
+            "motion": np.repeat(np.where(self.measured, ACCEL_STD, MOTION), 3),
+        }
+        self.std = np.concatenate([*parts.values()])
+        names = np.repeat([*parts], [len(part) for part in parts.values()])
+        self.robust = np.isin(names, ["radio", "distance", "height"])
+        self.rows = {name: np.flatnonzero(names == name) for name in parts}
 
     def solve(self, path: np.ndarray, columns: np.ndarray) -> Fit:
         """Return the minimum that Levenberg-Marquardt steps reach from path (J, 3) and columns."""
@@ -99,7 +112,7 @@ class Problem:
             equations = Equations(state)
             for _ in range(TRIES):
                 following = equations.following(damping)
-                if following is not None and following.cost < state.cost:
+                if following.cost < state.cost:
                     break
                 damping *= MORE
             else:
@@ -115,38 +128,6 @@ class Problem:
         """Return the normal equations about a Fit."""
         return Equations(Fit(self, fit.path, fit.columns))
 
-    def spread(self, values: np.ndarray) -> np.ndarray:
-        """Return the gradient by the path (J, 3, s) of second differences (m, 3, s)."""
-        out = np.zeros((self.bins, *values.shape[1:]))
-        for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
-            out[self.middle + shift] += factor * values / STEP**2
-        return out
-
-    @cached_property
-    def smooth(self) -> np.ndarray:
-        """Normal equations of second differences: upper bands (7, 3J)."""
-        bands, weight = np.zeros((3, self.bins)), self.motion_weight / STEP**4
-        for shift, factor in ((-1, 1.0), (0, 4.0), (1, 1.0)):
-            bands[0][self.middle + shift] += factor * weight
-        bands[1][self.middle] -= 2.0 * weight
-        bands[1][self.middle + 1] -= 2.0 * weight
-        bands[2][self.middle + 1] += weight
-        out = np.zeros((7, 3 * self.bins))
-        out[6], out[3], out[0] = (np.repeat(band, 3) for band in bands)
-        out[6] += WEAK
-        return out
-
-    @cached_property
-    def pattern(self) -> tuple[np.ndarray, csr_matrix]:
-        """(order, matrix): places of (n, 3) derivatives by positions of the tag in (3J, n)."""
-        count = len(self.seen.d)
-        rows = (3 * self.seen.bin[:, None] + np.arange(3)).ravel()
-        numbers = np.arange(3 * count) + 1.0
-        matrix = csr_matrix(
-            (numbers, (rows, np.repeat(np.arange(count), 3))), shape=(3 * self.bins, count)
-        )
-        return matrix.data.astype(int) - 1, matrix
-
 
 class Fit:
     """Residuals of a Problem at a path and columns; `Problem.solve` returns that of a minimum.
@@ -154,6 +135,7 @@ class Fit:
     Attributes
     ----------
     path : (J, 3) m; columns : (k,); anchors : (N, 3) m, positions in the columns
+    radio, distance, height : m, accel : (m, 3) m/s^2, residuals; residual : (n,), all of them
     cost : negative log-likelihood
     """
 
@@ -180,21 +162,57 @@ class Fit:
         one, other_end = problem.ends
         length, self.along = _length(anchors[one] - anchors[other_end])
         self.distance = length + between[one] + between[other_end] - seen.distances[:, 2]
-        known = problem.coordinates
-        self.coordinate = columns[known] - seen.coordinates[: len(known), 2]
-        self.coordinate_std = seen.coordinates[: len(known), 3]
-        self.cost = self._cost()
+        coordinate = columns[problem.coordinates] - problem.known[:, 2]
+        parts = self.radio, columns, coordinate, self.distance, self.height, self.accel.ravel()
+        self.residual = np.concatenate(parts)
+        square = (self.residual / problem.std) ** 2
+        likely = (NU + 1.0) * np.log1p(square[problem.robust] / NU)
+        self.cost = 0.5 * float(likely.sum() + square[~problem.robust].sum())
 
-    def _cost(self) -> float:
-        problem = self.problem
-        return float(
-            _student(self.radio / problem.std)
-            + _student(self.height / HEIGHT_STD)
-            + _student(self.distance / problem.distance_std)
-            + 0.5 * np.sum(problem.motion_weight[:, None] * self.accel**2)
-            + 0.5 * np.sum((self.coordinate / self.coordinate_std) ** 2)
-            + 0.5 * np.sum(problem.prior * self.columns**2)
+    @property
+    def weight(self) -> np.ndarray:
+        """Weights of the residuals, (n,): those of Student's t where they are robust."""
+        std, robust = self.problem.std, self.problem.robust
+        students = (NU + 1.0) / (NU + (self.residual / std) ** 2)
+        return np.where(robust, students, 1.0) / std**2
+
+    def jacobian(self) -> csr_matrix:
+        """Return the derivatives of the residuals by the path and the columns, (n, 3J + k)."""
+        problem, layout, xyz = self.problem, self.problem.layout, np.arange(3)
+        seen, two, size = problem.seen, problem.two, 3 * problem.bins
+        entries: list[list[np.ndarray]] = []
+
+        def add(rows: ArrayLike, columns: ArrayLike, values: ArrayLike) -> None:
+            entries.append([part.ravel() for part in np.broadcast_arrays(rows, columns, values)])
+
+        rows = problem.rows["radio"]
+        add(
+            rows[:, None],
+            3 * seen.bin[:, None] + xyz,
+            self.by_b - np.where(two[:, None], self.by_a, 0.0),
         )
+        add(rows[:, None], size + 3 * seen.b[:, None] + xyz, -self.by_b)
+        add(rows[two, None], size + 3 * seen.a[two, None] + xyz, self.by_a[two])
+        add(rows, size + layout.delays.start + seen.b, 1.0)
+        add(rows[two], size + layout.delays.start + seen.a[two], -1.0)
+        add(rows[~two], size + problem.of_flight[seen.bin[~two]] + 5, 1.0)
+        add(problem.rows["prior"], size + np.arange(layout.size), 1.0)
+        add(problem.rows["coordinate"], size + problem.coordinates, 1.0)
+        for end, sign in zip(problem.ends, (1.0, -1.0)):
+            rows = problem.rows["distance"]
+            add(rows[:, None], size + 3 * end[:, None] + xyz, sign * self.along)
+            add(rows, size + layout.between.start + end, 1.0)
+        add(problem.rows["height"], 3 * problem.high + 2, 1.0)
+        rows, middle = problem.rows["motion"].reshape(-1, 3), problem.middle[:, None]
+        for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+            add(rows, 3 * (middle + shift) + xyz, factor / STEP**2)
+        of_flight = size + problem.of_flight[middle]
+        by_yaw = self.turned[:, [1, 0]] * [1.0, -1.0]
+        add(rows[:, :2], of_flight, by_yaw)
+        add(rows[:, :2], of_flight + 1, by_yaw * seen.t[middle])
+        add(rows, of_flight + [2, 3, 4], -1.0 * problem.measured[:, None])
+        rows, columns, values = (np.concatenate(parts) for parts in zip(*entries))
+        return csr_matrix((values, (rows, columns)), (len(self.residual), size + layout.size))
 
 
 class Equations:
@@ -202,122 +220,36 @@ class Equations:
 
     Attributes
     ----------
-    weight : (n,) 1/m^2, of TDOAs and ranges; by_columns : (n, k), by_tag : (3J, n) their derivatives
-    by_distances : (m, k) derivatives of distances, weighted
+    path_gradient : (3J,), gradient : (k,) of the cost by the path and by the columns
     """
 
     def __init__(self, state: Fit) -> None:
-        self.state = state
-        self.problem = problem = state.problem
-        self.gram = np.diag(problem.prior)
-        self.gradient = problem.prior * state.columns
-        self.cross = np.zeros((3 * problem.bins, problem.layout.size))
-        self.path_gradient = np.zeros(3 * problem.bins)
-        self.bands = problem.smooth.copy()
-        self._add_radio()
-        self._add_motion()
-        self._add_anchors()
+        self.state, self.problem = state, state.problem
+        self._size = 3 * self.problem.bins
+        self._jacobian = state.jacobian()
+        self._weighted = self._jacobian.T.multiply(state.weight).tocsr()
+        gradient = self._weighted @ state.residual
+        self.path_gradient, self.gradient = np.split(gradient, [self._size])
+        weak = np.where(np.arange(len(gradient)) < self._size, WEAK, 0.0)
+        self._information = (self._weighted @ self._jacobian + diags(weak)).tocsc()
 
-    def _add_radio(self) -> None:
-        state, problem = self.state, self.state.problem
-        seen, layout, two = problem.seen, problem.layout, problem.two
-        row = np.arange(len(seen.d))
-        self.weight = _weight(state.radio, problem.std)
-        out = np.zeros((len(row), layout.size))
-        for axis in range(3):
-            out[row, 3 * seen.b + axis] = -state.by_b[:, axis]
-            out[row[two], 3 * seen.a[two] + axis] = state.by_a[two, axis]
-        out[row, layout.delays.start + seen.b] = 1.0
-        out[row[two], layout.delays.start + seen.a[two]] = -1.0
-        out[row[~two], problem.of_flight[seen.bin[~two]] + 5] = 1.0
-        self.by_columns = out
-        by_tag = state.by_b - np.where(two[:, None], state.by_a, 0.0)
-        order, pattern = problem.pattern
-        self.by_tag = csr_matrix(
-            (by_tag.ravel()[order], pattern.indices, pattern.indptr), shape=pattern.shape
-        )
-        weighted = out * self.weight[:, None]
-        self.gram += out.T @ weighted
-        self.gradient = self.gradient + weighted.T @ state.radio
-        self.cross += self.by_tag @ weighted
-        self.path_gradient += self.by_tag @ (self.weight * state.radio)
-        for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2)):
-            sums = np.bincount(
-                seen.bin, self.weight * by_tag[:, i] * by_tag[:, k], minlength=problem.bins
-            )
-            self.bands[6 + i - k, k::3] += sums
-
-    def _add_motion(self) -> None:
-        state, problem = self.state, self.state.problem
-        seen = problem.seen
-        weight = problem.motion_weight[:, None] * state.accel
-        self.path_gradient += problem.spread(weight).ravel()
-        height = _weight(state.height, np.full(len(problem.high), HEIGHT_STD))
-        self.bands[6, 3 * problem.high + 2] += height
-        self.path_gradient[3 * problem.high + 2] += height * state.height
-        for number, first in enumerate(problem.layout.of_flights):
-            chosen = problem.measured & (seen.flight[problem.middle] == number)
-            rows = np.flatnonzero(chosen)
-            by = np.zeros((len(chosen), 3, 5))
-            x, y, _ = state.turned[rows].T
-            by[rows, 0, 0], by[rows, 1, 0] = y, -x
-            by[rows, :, 1] = by[rows, :, 0] * seen.t[problem.middle[rows], None]
-            for axis in range(3):
-                by[rows, axis, 2 + axis] = -1.0
-            columns = first + np.arange(5)
-            weighted = by * problem.accel_weight[:, None, None]
-            self.gram[np.ix_(columns, columns)] += np.einsum("nki,nkj->ij", by, weighted)
-            self.gradient[columns] += np.einsum("nki,nk->i", weighted, state.accel)
-            self.cross[:, columns] += problem.spread(weighted).reshape(-1, 5)
-
-    def _add_anchors(self) -> None:
-        state, problem = self.state, self.state.problem
-        one, other = problem.ends
-        row = np.arange(len(one))
-        by = np.zeros((len(one), problem.layout.size))
-        for axis in range(3):
-            by[row, 3 * one + axis] = state.along[:, axis]
-            by[row, 3 * other + axis] = -state.along[:, axis]
-        by[row, problem.layout.between.start + one] = 1.0
-        by[row, problem.layout.between.start + other] = 1.0
-        weighted = by * _weight(state.distance, problem.distance_std)[:, None]
-        self.gram += by.T @ weighted
-        self.gradient = self.gradient + weighted.T @ state.distance
-        self.by_distances = weighted
-        known, information = problem.coordinates, state.coordinate_std**-2.0
-        np.add.at(self.gram, (known, known), information)
-        np.add.at(self.gradient, known, information * state.coordinate)
-
-    def following(self, damping: float) -> Fit | None:
-        """Return the state after a step; None if the equations are singular."""
-        bands = self.bands.copy()
-        bands[6] *= 1.0 + damping
-        gram = self.gram + damping * np.diag(np.diag(self.gram))
-        try:
-            factor = _factor(bands)
-            solved = _solved(factor, np.column_stack([self.cross, self.path_gradient]))
-            reduced = cho_factor(gram - self.cross.T @ solved[:, :-1], check_finite=False)
-        except LinAlgError:
-            return None
-        columns = -cho_solve(reduced, self.gradient - self.cross.T @ solved[:, -1])
-        path = -(solved[:, -1] + solved[:, :-1] @ columns)
+    def following(self, damping: float) -> Fit:
+        """Return the state after a step."""
+        damped = self._information + diags(damping * self._information.diagonal())
+        gradient = np.concatenate([self.path_gradient, self.gradient])
+        path, columns = np.split(-_factor(damped).solve(gradient), [self._size])
         state = self.state
         return Fit(self.problem, state.path + path.reshape(-1, 3), state.columns + columns)
 
     @cached_property
-    def path_factor(self) -> np.ndarray:
-        """Factor of the normal equations of the path."""
-        return _factor(self.bands)
-
-    @cached_property
-    def path_by_columns(self) -> np.ndarray:
-        """Minus the derivatives of the best path by the columns, (3J, k)."""
-        return _solved(self.path_factor, self.cross)
+    def _solver(self) -> SuperLU:
+        return _factor(self._information)
 
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance of the columns, (k, k), for independent errors."""
-        return np.linalg.inv(self.gram - self.cross.T @ self.path_by_columns)
+        every = np.eye(self._information.shape[0])
+        return self._solver.solve(every[:, self._size :])[self._size :]
 
     def misfit(self) -> np.ndarray:
         """Return the mean square of accelerations over ACCEL_STD^2, of each flight; NaN without."""
@@ -331,71 +263,33 @@ class Equations:
                 out[number] = square[chosen].mean()
         return out
 
-    def response(
-        self, radio: np.ndarray, accel: np.ndarray, others: tuple[np.ndarray, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of the columns (k, s) that s draws of errors of measurements cause.
 
         Also return the residuals of radio measurements with these errors, (n, s) m.
 
-        radio : (n, s) m, errors of radio measurements
-        accel : (m, 3, s) m/s^2, errors of accelerations at the middle bins
-        others : gradients by the columns (k, s) and by the path (3J, s) that other errors make, as of
-            `others`
+        Errors of accelerations move the path. What yaw and biases could take up of them is not counted:
+        the stated deviations are larger by that.
+
+        errors : (n, s), of the measurements of all residuals
         """
-        problem = self.problem
-        weighted = -self.weight[:, None] * radio
-        column_gradient = others[0] + self.by_columns.T @ weighted
-        spread = problem.spread(-problem.motion_weight[:, None, None] * accel)
-        path_gradient = others[1] + self.by_tag @ weighted + spread.reshape(-1, radio.shape[1])
-        solved = _solved(self.path_factor, path_gradient)
-        columns = -self.covariance @ (column_gradient - self.cross.T @ solved)
-        path = -(solved + self.path_by_columns @ columns)
-        return columns, self.by_columns @ columns + self.by_tag.T @ path - radio
-
-    def others(self, rng: np.random.Generator, draws: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return draws of the gradients that errors of heights, distances, coordinates and priors make."""
-        problem = self.problem
-        size = problem.layout.size
-        columns = np.sqrt(problem.prior)[:, None] * rng.standard_normal((size, draws))
-        known = problem.coordinates
-        std = problem.seen.coordinates[: len(known), 3]
-        noise = rng.standard_normal((len(known), draws)) / std[:, None]
-        np.add.at(columns, known, noise)
-        between = self.by_distances * problem.distance_std[:, None]
-        columns += between.T @ rng.standard_normal((len(between), draws))
-        path = np.zeros((3 * problem.bins, draws))
-        high = 3 * problem.high + 2
-        path[high] = rng.standard_normal((len(high), draws)) / HEIGHT_STD
-        return columns, path
+        gradient, motion = self._weighted @ errors, self.problem.rows["motion"]
+        gradient[self._size :] -= self._weighted[self._size :, motion] @ errors[motion]
+        change = self._solver.solve(gradient)
+        left = self._jacobian @ change - errors
+        return change[self._size :], left[self.problem.rows["radio"]]
 
 
-def _factor(bands: np.ndarray) -> np.ndarray:
-    """Return the Cholesky factor of upper bands; without a path there are none."""
-    return cholesky_banded(bands, check_finite=False) if bands.size else bands
-
-
-def _solved(factor: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the solution of the equations of a `_factor`."""
-    if not factor.size:
-        return values
-    return cho_solve_banded((factor, False), values, check_finite=False)
+def _factor(information: csc_matrix) -> SuperLU:
+    """Return the factor of normal equations: those of the path are banded, the columns come last."""
+    settings: dict[str, Any] = {"permc_spec": "NATURAL", "diag_pivot_thresh": 0.0}
+    return splu(information.tocsc(), **settings, options={"SymmetricMode": True})
 
 
 def _length(line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return lengths (n,) of lines (n, 3), and their directions."""
     length = np.sqrt(np.sum(line**2, axis=1) + 1e-9)
     return length, line / length[:, None]
-
-
-def _student(value: np.ndarray) -> float:
-    """Return the negative log-likelihood of normalized residuals under Student's t."""
-    return 0.5 * (NU + 1.0) * float(np.log1p(value**2 / NU).sum())
-
-
-def _weight(residual: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the weights of Student's t, 1/m^2."""
-    return (NU + 1.0) / (NU + (residual / std) ** 2) / std**2
 
 
 STARTS, MOST_STARTS = 6, 24  # starting points of shapes, and the most if only one reached the best

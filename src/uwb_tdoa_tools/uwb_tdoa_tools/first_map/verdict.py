@@ -63,17 +63,19 @@ def covariance(linear: Equations, fit: Fit, rng: np.random.Generator) -> tuple[n
     smooth = np.einsum("jr,nrs->njs", root, draws)
     radio = smooth[seen.b, seen.bin]
     radio -= np.where(problem.two[:, None], smooth[problem.first, seen.bin], 0.0)
-    still = np.zeros((len(problem.middle), 3, DRAWS))
-    nothing = np.zeros((problem.layout.size, DRAWS)), np.zeros((3 * problem.bins, DRAWS))
-    lasting, left = linear.response(radio, still, nothing)
+    errors = np.zeros((len(problem.std), DRAWS))
+    errors[problem.rows["radio"]] = radio
+    lasting, left = linear.response(errors)
     scale = _scale(linear.state.radio)
     pairs = _neighbours(linear)
     clipped = np.clip(linear.state.radio, -CLIPPED * scale, CLIPPED * scale)
     together = max(_lasting(clipped[:, None], pairs), LEAST_SHARE * scale**2)
     std = float(np.sqrt(together / max(_lasting(left, pairs), 1e-9)))
-    noise = scale * rng.standard_normal(radio.shape)
-    rest = linear.others(rng, DRAWS)
-    independent, _ = linear.response(noise, _accelerations(linear, rng), rest)
+    motion, others = problem.rows["motion"], len(problem.std) - len(problem.rows["motion"])
+    size_of = np.where(np.arange(others) < len(radio), scale, -problem.std[:others])
+    errors[:others] = size_of[:, None] * rng.standard_normal((others, DRAWS))
+    errors[motion] = _accelerations(linear, rng).reshape(-1, DRAWS)
+    independent, _ = linear.response(errors)
     total = std * lasting[:size] + independent[:size]
     return least + MARGIN * total @ total.T / DRAWS, std
 
