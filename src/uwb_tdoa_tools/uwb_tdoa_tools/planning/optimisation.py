@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.geometry import ranges
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..parallel import Progress
@@ -28,8 +27,6 @@ from .precision import (
     bound,
     information,
     position_error,
-    round_weights,
-    weigh,
 )
 from .report import quantiles
 
@@ -161,14 +158,15 @@ class Goal:
     installation: Installation
     demand: Demand = field(default_factory=Demand)
 
-    def errors(self, anchors: Anchors) -> np.ndarray:
-        """Return the bound at the points: (n,) m. Raises InputError for useless anchors.
+    def errors(self, anchors: Anchors, points: np.ndarray | None = None) -> np.ndarray:
+        """Return the bound at the points (default: its own): (n,) m, at most UNUSABLE.
 
         The small second term of eq. 1 is left out.
         """
-        installation = replace(self.installation, anchors=anchors)
-        found = position_error(bound(information(self.points, installation, correction=False)))
-        return np.minimum(found, UNUSABLE)
+        points = self.points if points is None else points
+        installation = self.installation.with_anchors(anchors)
+        found = position_error(bound(information(points, installation, correction=False)))
+        return np.fmin(found, UNUSABLE)
 
     def figures(self, anchors: Anchors) -> dict[str, float]:
         """Return {"worst", "mean": m, of the bound; "failing": share that cannot be flown}."""
@@ -190,7 +188,6 @@ class Goal:
 
 
 _ARM = 3.0  # m; to move an anchor so far changes about as much as to turn it by 1 rad
-_STEP = 1e-6  # of x, for derivatives
 
 
 @dataclass(frozen=True)
@@ -233,27 +230,6 @@ class Layout:
         placed = self._placed(np.reshape(x, (self.count, self.width)))
         return Anchors(np.arange(self.count), *placed)
 
-    def nudged(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return all anchors, and again after a small step of each number.
-
-        Returns positions ((1 + width) count, 3) m, orientations likewise, and steps (len(x),).
-        """
-        rows = np.reshape(x, (self.count, self.width))
-        upper = np.reshape(self.bounds, (self.count, self.width, 2))[:, :, 1]
-        steps = np.where(rows > 0.5 * upper, -_STEP, _STEP)  # not over the upper end of a place
-        moved = np.concatenate([rows[None], rows + steps * np.eye(self.width)[:, None]])
-        return *self._placed(moved.reshape(-1, self.width)), steps.ravel()
-
-    def columns(self) -> np.ndarray:
-        """Return the rows of `nudged` of each layout: (1 + len(x), N).
-
-        The first layout is x, then x after the step of each number.
-        """
-        chosen = np.tile(np.arange(self.count), (1 + self.count * self.width, 1))
-        anchor, number = np.divmod(np.arange(self.count * self.width), self.width)
-        chosen[1 + np.arange(len(anchor)), anchor] = self.count * (1 + number) + anchor
-        return chosen
-
     def _placed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (n, 3) m and orientations (n, 4) of rows (n, width)."""
         n = self.places.numbers
@@ -271,38 +247,6 @@ def free_ids(taken: np.ndarray, count: int) -> np.ndarray:
 
 
 LEAST_GAIN = 1e-4  # of the log of the bound: a step that gains less is the last
-_CHUNK = 1_000_000  # numbers in the largest array of one step
-
-
-def errors_and_slopes(
-    goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bound at points (n, 3) m and its derivatives along x: (n,) m, (n, len(x)).
-
-    A number of x changes one column of the ranges and variances. So each column is computed once,
-    and the information of all changed layouts in one batch. d sqrt(tr J^-1) = -tr(J^-2 dJ) / (2
-    sqrt(tr J^-1)).
-    """
-    installation, k = goal.installation, goal.installation.dimensions
-    positions, orientations, steps = layout.nudged(x)
-    every = Anchors(np.arange(len(positions)), positions, orientations)
-    variance = installation.noise.variance(points, every)
-    unit = ranges(points[:, None], positions)[1]
-    chosen = layout.columns()
-    count = chosen.shape[1]
-    size = len(points) * chosen.size * count
-    parts = []
-    for rows in np.array_split(np.arange(len(points)), max(1, size // _CHUNK)):
-        weights = round_weights(variance[rows][:, chosen].reshape(-1, count), installation)
-        parts.append(weigh(unit[rows][:, chosen, :k].reshape(-1, count, k), weights))
-    information = np.concatenate(parts).reshape(len(points), -1, k, k)
-    covariance = bound(installation.with_height(information[:, 0]))
-    errors = position_error(covariance)
-    lost = ~(errors < UNUSABLE)
-    covariance[lost], errors[lost] = 0.0, UNUSABLE
-    change = (information[:, 1:] - information[:, :1]) / steps[:, None, None]
-    slopes = -0.5 * np.einsum("nij,nvji->nv", covariance @ covariance, change) / errors[:, None]
-    return errors, slopes
 
 
 def descend(
@@ -314,23 +258,10 @@ def descend(
     constraint per point. Which layout fails least is no part of a descent: `Goal.score` judges the ends.
     """
     size, (low, high) = len(x), np.transpose(layout.bounds)
-    seen: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}  # of the last x
 
-    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (errors, slopes) at x."""
+    def log_errors(x: np.ndarray) -> np.ndarray:
         x = np.clip(np.nan_to_num(x), low, high)  # SLSQP has been seen to ask for NaN
-        key = x.tobytes()
-        if key not in seen:
-            seen.clear()
-            seen[key] = errors_and_slopes(goal, layout, x, points)
-        return seen[key]
-
-    def below(z: np.ndarray) -> np.ndarray:
-        return z[size] - np.log(at(z[:size])[0])
-
-    def below_slopes(z: np.ndarray) -> np.ndarray:
-        errors, slopes = at(z[:size])
-        return np.column_stack([-slopes / errors[:, None], np.ones(len(points))])
+        return np.log(goal.errors(layout.anchors(x), points))
 
     def worst(z: np.ndarray) -> tuple[float, np.ndarray]:
         return z[size], np.append(np.zeros(size), 1.0)
@@ -338,8 +269,8 @@ def descend(
     x = np.clip(x, low, high)
     options: dict[str, Any] = {"jac": True, "method": "SLSQP"}
     options["options"] = {"maxiter": sweeps, "ftol": LEAST_GAIN}
-    z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
-    constraint = {"type": "ineq", "fun": below, "jac": below_slopes}
+    z, bounds = np.append(x, log_errors(x).max()), [*layout.bounds, (None, None)]
+    constraint = {"type": "ineq", "fun": lambda z: z[size] - log_errors(z[:size])}
     found = minimize(worst, z, bounds=bounds, constraints=[constraint], **options)
     return np.clip(np.nan_to_num(found.x[:size]), low, high)
 
@@ -470,10 +401,7 @@ def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.
     """
     best, score = x, goal.score(layout.anchors(x))
     for _ in range(EXCHANGES):
-        try:
-            errors = goal.errors(layout.anchors(x))
-        except InputError:  # two anchors have met
-            break
+        errors = goal.errors(layout.anchors(x))
         if errors.max() <= CLOSE * errors[rows].max():
             break
         worst = np.argsort(-errors)[: 1 + len(errors) // 20]
