@@ -37,7 +37,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-import math
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,6 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import ranges
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, Antenna, RadioLink, received_power_dbm
@@ -538,7 +536,8 @@ FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
 NEAREST = 8  # anchors whose choices of k + 1 are mirrored
 DESCENTS = 12  # from the mirrored places of least misfit
-MAX_STEPS = 60  # of a descent
+MAX_TRIES = 100  # of a descent
+MOST_REFUSED = 12  # tries in a row that do not lead down
 SETTLED = 0.01  # a descent ends where another step would lower f by less than this
 LONGEST = 5.0  # m, of a step
 AROUND = 2.0  # m outside of the room, to which starts farther out are moved
@@ -555,203 +554,145 @@ def other_solutions(
     and more than FLIP away.
     points : (n, 3) m; columns : (n, K) rows of the anchors that are heard at each point; None for all.
     """
-    anchors = installation.anchors
+    anchors, unknowns = installation.anchors, installation.unknowns
     if columns is None:
         columns = np.tile(np.arange(len(anchors)), (len(points), 1))
     heard = columns.shape[1]
-    choices = np.array(list(combinations(range(min(NEAREST, heard)), installation.unknowns + 1)))
-    corners = np.stack([room.lower, room.upper])
-    out = np.empty((len(points), 4))
-    at_once = max(1, _OF_MINIMA // max(heard**2, len(anchors)))
-    for begin in range(0, len(points), at_once):
-        some = slice(begin, begin + at_once)
+    choices = np.array(list(combinations(range(min(NEAREST, heard)), unknowns + 1)))
+    size = len(points) * max(DESCENTS * heard**2, len(anchors), 9 * len(choices))
+    out = np.full((len(points), 4), np.nan)
+    for some in np.array_split(np.arange(len(points)), max(1, size // _OF_MINIMA)):
         variances = installation.noise.variance(points[some], anchors)
-        variance = np.take_along_axis(variances, columns[some], axis=1)
-        weights = np.ascontiguousarray(round_weights(variance, installation))
-        heard_at = np.ascontiguousarray(columns[some])
-        _search(points[some], anchors.positions, heard_at, weights, corners, choices, out[some])
+        weights = round_weights(np.take_along_axis(variances, columns[some], axis=1), installation)
+        rounds = _Rounds(points[some], anchors.positions[columns[some]], weights, unknowns)
+        row, x = rounds.starts(choices, room)
+        f, x = rounds.descended(row, x)
+        inside = ((x >= room.lower) & (x <= room.upper))[:, :unknowns].all(axis=1)
+        f[~inside | (np.linalg.norm(x - points[some][row], axis=1) <= FLIP)] = np.inf
+        out[some, 0] = np.inf
+        least = np.lexsort((f, row))
+        least = least[np.unique(row[least], return_index=True)[1]]
+        least = least[f[least] < np.inf]
+        out[some[row[least]]] = np.column_stack([f, x])[least]
     return np.sqrt(out[:, 0]), out[:, 1:]
 
 
-@compiled
-def _search(
-    points: np.ndarray,
-    positions: np.ndarray,
-    columns: np.ndarray,
-    weights: np.ndarray,
-    room: np.ndarray,
-    choices: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    """Fill out (n, 4): misfit squared and place, m; inf and NaN without a second minimum.
+@dataclass(frozen=True)
+class _Rounds:
+    """Rounds of TDOAs at n points, and descents along their misfits.
 
-    points, columns : as of `other_solutions`; positions : (N, 3) m of anchors
-    weights : (n, K, K) 1/m^2, Q; room : (2, 3) m, its corners
-    choices : (C, k + 1) indices into the heard anchors, nearest first
+    Attributes
+    ----------
+    points : (n, 3) m
+    anchors : (n, K, 3) m, that are heard at each point
+    weights : (n, K, K) 1/m^2, Q
+    unknowns : k, 2 or 3
     """
-    heard, unknowns = columns.shape[1], choices.shape[1] - 1
-    anchors, distances, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
-    starts, values = np.empty((len(choices), 3)), np.empty(len(choices))
-    for n in range(len(points)):
-        point = points[n]
-        out[n, 0] = np.inf
-        out[n, 1:] = np.nan
-        for i in range(heard):
-            anchors[i] = positions[columns[n, i]]
-            distances[i] = _distance(point, anchors[i])
-        nearest = np.argsort(distances)
-        for c in range(len(choices)):
-            values[c] = np.inf
-            if _mirror(point, anchors, distances, nearest[choices[c]], starts[c]):
-                for axis in range(unknowns):
-                    low, high = room[0, axis] - AROUND, room[1, axis] + AROUND
-                    starts[c, axis] = min(max(starts[c, axis], low), high)
-                values[c] = _misfit(starts[c], anchors, distances, weights[n])
-        best = np.argsort(values)
-        for c in range(min(DESCENTS, len(choices))):
-            start = starts[best[c]]
-            skipped = not values[best[c]] < np.inf or _distance(start, point) < SAME
-            for better in range(c):
-                skipped = skipped or _distance(start, starts[best[better]]) < SAME
-            if skipped:
-                continue
-            f = _descend(start, point, anchors, distances, weights[n], unknowns, end)
-            for axis in range(unknowns):
-                f = f if room[0, axis] <= end[axis] <= room[1, axis] else np.inf
-            if f < out[n, 0] and _distance(end, point) > FLIP:
-                out[n, 0] = f
-                out[n, 1:] = end
+
+    points: np.ndarray
+    anchors: np.ndarray
+    weights: np.ndarray
+    unknowns: int
+
+    def misfit(self, row: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return f at places x (m, 3) for the points `row`, its gradient and Hessian, both halved.
+
+        The Hessian is that of Gauss and Newton: without the curvature of the distances.
+        """
+        away = x[:, None] - self.anchors[row]
+        r = _length(away)
+        true = _length(self.points[row, None] - self.anchors[row])
+        both = np.concatenate(
+            [away[..., : self.unknowns] / np.maximum(r, 1e-9)[..., None], (r - true)[..., None]],
+            axis=-1,
+        )
+        normal = both.swapaxes(1, 2) @ (self.weights[row] @ both)
+        return np.maximum(normal[:, -1, -1], 0.0), normal[:, :-1, -1], normal[:, :-1, :-1]
+
+    def starts(self, choices: np.ndarray, room: Room) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mirrored places of least misfit, apart from each other: (row (m,), x (m, 3) m).
+
+        choices : (C, k + 1) indices into the heard anchors, nearest first
+        """
+        true = _length(self.points[:, None] - self.anchors)
+        nearest = np.argsort(true, axis=1)
+        corners = np.take_along_axis(self.anchors, nearest[..., None], axis=1)[:, choices]
+        x = _mirrored(self.points, corners, self.unknowns)
+        k = slice(self.unknowns)
+        x[..., k] = np.clip(x[..., k], room.lower[k] - AROUND, room.upper[k] + AROUND)
+        change = _length(x[:, :, None] - self.anchors[:, None]) - true[:, None]
+        f = np.einsum("nck,nck->nc", change @ self.weights, change)
+        best = np.argsort(f, axis=1)[:, :DESCENTS]  # NaN comes last
+        x = np.take_along_axis(x, best[..., None], axis=1)
+        apart = _length(x[:, :, None] - x[:, None]) >= SAME
+        kept = (apart | np.triu(np.ones(apart.shape[1:], bool))).all(axis=2)
+        kept &= _length(x - self.points[:, None]) >= SAME
+        return np.nonzero(kept)[0], x[kept]
+
+    def descended(self, row: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where descents from x (m, 3) end: (f (m,), place (m, 3) m).
+
+        f is inf if the descent does not end, or ends at the point itself.
+        """
+        x, end = x.copy(), np.full(len(x), np.inf)
+        f, gradient, hessian = self.misfit(row, x)
+        damping, refused = np.full(len(x), 1e-2), np.zeros(len(x), int)
+        going = np.arange(len(x))
+        for _ in range(MAX_TRIES):
+            lifted = damping[going, None] * np.diagonal(hessian[going], axis1=1, axis2=2) + 1e-12
+            damped = hessian[going] + lifted[..., None] * np.eye(self.unknowns)
+            step = -np.linalg.solve(damped, gradient[going, :, None])[..., 0]
+            length = _length(step)
+            gain = -np.sum(step * gradient[going], axis=1)
+            settled = (gain < SETTLED) & (damping[going] <= 1e-2) & (length < 0.5 * FLIP)
+            # a corner of f, at an anchor: it is lower there than around
+            settled |= refused[going] == MOST_REFUSED
+            end[going[settled]] = f[going[settled]]
+            step *= np.minimum(1.0, LONGEST / np.maximum(length, 1e-12))[:, None]
+            going, step = going[~settled], step[~settled]
+            tried = x[going]
+            tried[:, : self.unknowns] += step
+            found = self.misfit(row[going], tried)
+            lower = found[0] < f[going]
+            for kept, value in zip((x, f, gradient, hessian), (tried, *found)):
+                kept[going[lower]] = value[lower]
+            damping[going] = np.where(
+                lower, np.maximum(0.2 * damping[going], 1e-6), 6.0 * damping[going]
+            )
+            refused[going] = np.where(lower, 0, refused[going] + 1)
+            away = _length(x[going] - self.points[row[going]])
+            going = going[away >= FLIP]
+            if not len(going):
+                break
+        return end, x
 
 
-@compiled
-def _mirror(
-    point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.ndarray, out: np.ndarray
-) -> bool:
-    """Put the other solution of k + 1 anchors into `out`; return whether there is one.
+def _mirrored(points: np.ndarray, corners: np.ndarray, unknowns: int) -> np.ndarray:
+    """Return the other solutions of choices of k + 1 anchors: (n, C, 3) m, NaN where there is none.
 
     If the anchors are in a plane (line), it is the place on its other side.
+    points : (n, 3) m; corners : (n, C, k + 1, 3) m, the anchors; unknowns : k
     """
-    k, first = len(rows) - 1, anchors[rows[0]]
-    matrix, right, q = np.eye(3), np.zeros(3), np.empty(3)
-    size = 1e-9
-    for i in range(k):
-        for j in range(k):
-            matrix[j, i] = anchors[rows[i + 1], j] - first[j]
-            size = max(size, abs(matrix[j, i]))
-    out[:] = point
-    if abs(_volume(matrix[0], matrix[1], matrix[2])) < _FLAT * size**k:
-        normal = np.cross(matrix[:, 0], matrix[:, 4 - k])
-        length = math.sqrt(np.sum(normal**2))
-        if length < _FLAT * size ** (k - 1):
-            return False
-        normal /= length
-        out -= 2.0 * np.sum((point - first) * normal) * normal
-        return True
-    r = true[rows[0]]
-    for i in range(k):
-        right[i] = r - true[rows[i + 1]]
-    _solve(matrix, right, q)
-    squared, product = 0.0, 0.0
-    for j in range(3):
-        squared += q[j] ** 2
-        product += (point[j] - first[j] - q[j] * r) ** 2
-    if squared <= 1.0:
-        return False
-    other = product / ((squared - 1.0) * max(r, 1e-12))
-    for j in range(k):
-        out[j] += q[j] * (other - r)
-    return True
+    true = _length(points[:, None, None] - corners)
+    away = points[:, None] - corners[:, :, 0]
+    edges = np.broadcast_to(np.eye(3), (*away.shape, 3)).copy()
+    block = corners[:, :, 1:, :unknowns] - corners[:, :, :1, :unknowns]
+    edges[..., :unknowns, :unknowns] = block
+    size = np.maximum(np.abs(block).max(axis=(2, 3)), 1e-9)
+    flat = np.abs(np.linalg.det(edges)) < _FLAT * size**unknowns
+    normal = np.cross(edges[..., 0, :], edges[..., 4 - unknowns, :])
+    length = _length(normal)
+    normal /= np.where(length < _FLAT * size ** (unknowns - 1), np.nan, length)[..., None]
+    across = -2.0 * np.sum(away * normal, axis=-1, keepdims=True) * normal
+    r, right = true[..., :1], np.zeros((*away.shape, 1))
+    right[..., :unknowns, 0] = r - true[..., 1:]
+    q = np.linalg.solve(np.where(flat[..., None, None], np.eye(3), edges), right)[..., 0]
+    squared = np.sum(q**2, axis=-1, keepdims=True)
+    product = np.sum((away - q * r) ** 2, axis=-1, keepdims=True)
+    other = product / (np.where(squared > 1.0, squared - 1.0, np.nan) * np.maximum(r, 1e-12))
+    return points[:, None] + np.where(flat[..., None], across, q * (other - r))
 
 
-@compiled
-def _solve(matrix: np.ndarray, right: np.ndarray, out: np.ndarray) -> None:
-    """Put x with sum_j matrix[j] x_j = right into `out`, (3,), by Cramer's rule.
-
-    It takes 6 ns, np.linalg.solve 360 ns. A descent calls it in each step.
-    """
-    volume = _volume(matrix[0], matrix[1], matrix[2])
-    out[0] = _volume(right, matrix[1], matrix[2]) / volume
-    out[1] = _volume(matrix[0], right, matrix[2]) / volume
-    out[2] = _volume(matrix[0], matrix[1], right) / volume
-
-
-@compiled
-def _volume(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
-    return (
-        a[0] * (b[1] * c[2] - b[2] * c[1])
-        - a[1] * (b[0] * c[2] - b[2] * c[0])
-        + a[2] * (b[0] * c[1] - b[1] * c[0])
-    )
-
-
-@compiled
-def _distance(p: np.ndarray, q: np.ndarray) -> float:
-    return math.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
-
-
-@compiled
-def _misfit(x: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.ndarray) -> float:
-    """Return f at x."""
-    change, total = np.empty(len(anchors)), 0.0
-    for i in range(len(anchors)):
-        change[i] = _distance(x, anchors[i]) - true[i]
-        row = 0.0
-        for j in range(i):
-            row += weight[i, j] * change[j]
-        total += change[i] * (2.0 * row + weight[i, i] * change[i])
-    return max(total, 0.0)
-
-
-@compiled
-def _descend(
-    start: np.ndarray,
-    point: np.ndarray,
-    anchors: np.ndarray,
-    true: np.ndarray,
-    weight: np.ndarray,
-    unknowns: int,
-    end: np.ndarray,
-) -> float:
-    """Return f at the end of a descent, and put the place into `end`.
-
-    Returns inf if the descent does not end, or ends at the point itself.
-    """
-    x, f = start.copy(), _misfit(start, anchors, true, weight)
-    both, weighed = np.empty((len(anchors), 4)), np.empty((len(anchors), 4))
-    normal, damped, right, step = np.empty((4, 4)), np.eye(3), np.zeros(3), np.empty(3)
-    damping = 1e-2
-    for _ in range(MAX_STEPS):
-        for i in range(len(anchors)):
-            r = _distance(x, anchors[i])
-            for k in range(3):
-                both[i, k] = (x[k] - anchors[i, k]) / max(r, 1e-9)
-            both[i, 3] = r - true[i]
-        np.dot(weight, both, weighed)
-        np.dot(both.T, weighed, normal)
-        right[:unknowns] = -normal[:unknowns, 3]
-        lower = False
-        for _ in range(12):  # until a step leads down
-            damped[:unknowns, :unknowns] = normal[:unknowns, :unknowns]
-            for a in range(unknowns):
-                damped[a, a] += damping * normal[a, a] + 1e-12
-            _solve(damped, right, step)
-            length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-            gain = step[0] * right[0] + step[1] * right[1] + step[2] * right[2]
-            if gain < SETTLED and damping <= 1e-2 and length < 0.5 * FLIP:
-                end[:] = x
-                return f
-            for a in range(3):
-                end[a] = x[a] + step[a] * min(1.0, LONGEST / max(length, 1e-12))
-            new = _misfit(end, anchors, true, weight)
-            if new < f:
-                lower = True
-                x[:], f = end, new
-                damping = max(0.2 * damping, 1e-6)
-                break
-            damping *= 6.0
-        if not lower:  # a corner of f, at an anchor: it is lower there than around
-            end[:] = x
-            return f
-        if _distance(x, point) < FLIP:
-            return np.inf
-    return np.inf
+def _length(vectors: np.ndarray) -> np.ndarray:
+    """Return the lengths of vectors (..., k): (...). It is faster than np.linalg.norm."""
+    return np.sqrt(np.einsum("...k,...k", vectors, vectors))
