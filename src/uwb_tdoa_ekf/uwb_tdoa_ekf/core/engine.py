@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compiled filter: events in stamp order in, odometry and residuals out.
 
-FilterState holds the entire state between two calls. Each TDOA or range takes five steps:
+FilterState holds the entire state between two calls. Each TDOA or range takes six steps:
 
 1. `_predict` to its stamp (state.predict), or `_initialize` a filter that does not run
    (initialization.start).
 2. `_prepare`: detect rest (stationarity) and a position that is unknown after a silence.
 3. `_update` each hypothesis: innovation and Jacobian row (`_compare`, ranges.compare), weight
    (update.weigh), gain (update.kalman), probability (hypotheses.add_log_likelihood).
-4. `_select` the best hypothesis (hypotheses.select).
-5. `_recover` a filter that its TDOAs contradict (initialization.recover).
+4. Estimate the last TDOAs together, if the tag is alone and sends few (horizon.step).
+5. `_select` the best hypothesis (hypotheses.select).
+6. `_recover` a filter that its TDOAs contradict (initialization.recover).
 """
 
 from __future__ import annotations
