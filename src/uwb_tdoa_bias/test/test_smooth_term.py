@@ -16,6 +16,7 @@ from uwb_tdoa_bias.effects.samples import fade_weight
 from uwb_tdoa_bias.effects.smooth_term import FACTORS, SHAPES, described, shape_basis
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
+KNOTS[None] = 1.0, 1.5, 2.0, 2.5, 3.0  # of any number
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -255,6 +256,7 @@ def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
         ("below", [1.0, 1.5, 2.0, 2.5], [1.0, 0.5, 0.0, 0.0]),
         ("step", [1.9, 2.0, 4.0], [0.0, 1.0, 1.0]),
         ("interval", [1.4, 1.5, 2.4, 2.5], [0.0, 1.0, 1.0, 0.0]),
+        ("switching", [1.4, 1.5, 2.1, 2.5, 3.1], [0.0, 1.0, 0.0, 1.0, 1.0]),
         ("pulse", [0.9, 1.0, 1.9, 2.0, 3.1, 4.1, -0.5], [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0]),
         ("wave", [1.0, 1.5, 2.5], [0.0, 1.0, -1.0]),
     ],
@@ -265,7 +267,7 @@ def test_the_course_of_a_shape(shape, at, second):
     )
 
 
-@pytest.mark.parametrize("shape", ["line", "beyond", "below", "step", "interval"])
+@pytest.mark.parametrize("shape", ["line", "beyond", "below", "step", "interval", "switching"])
 def test_several_shapes_at_once_are_those_of_each(shape):
     one = np.array(KNOTS[SHAPES[shape][0]])
     several = np.stack([one, one + 0.3, 1.7 * one])
@@ -333,6 +335,17 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
             "",
             "each value of yaw_rate is 0.100 ± 0.005 rad/s larger for each s more of time "
             "(seen: time from 0 s to 4 s)",
+        ),
+        (
+            found_term(
+                {"2.c0": 0.0, "2.c1": 0.4},
+                "time",
+                "anchor",
+                (0.0, 3.0, 5.0, 9.0, 10.0),
+                "switching",
+            ),
+            "2",
+            "anchor 2 seems 0.40 ± 0.02 m farther for 30 % of the time, in 2 pieces of 1 s to 2 s",
         ),
         (
             found_term({"2.c0": 0.0, "2.c1": 0.4}, "time", "anchor", (3.0, 5.0, 11.0), "pulse"),

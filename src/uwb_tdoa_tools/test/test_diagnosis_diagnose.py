@@ -463,21 +463,43 @@ def test_diagnose_offers_it_beside_physics_and_judges_both():
     assert repairing.repaired(flights[:1], result.effects) == {}
 
 
+def switching(rng, shape, anchors):
+    """Return SmoothTerms of anchors that are 0.5 m late at times of their own, over 40 s."""
+    begin = rng.uniform(0.0, 9.0)
+    pulse = begin, begin + 2.9, begin + 9.2
+    random = 0.0, *np.cumsum(rng.exponential(2.5, 14) + 0.3).tolist(), 100.0
+    return [
+        SmoothTerm({f"{anchor}.c1": 0.5}, covariate="time", form="anchor", knots=knots, shape=shape)
+        for anchor, knots in zip(anchors, {"pulse": [pulse] * 2, "switching": [random]}[shape])
+    ]
+
+
 @pytest.mark.slow
-def test_pulses_of_any_phase_are_taken_out_of_each_flight():
-    """They recur in 9.2 s, and hide what flights share; a flight without them stays as it is."""
+@pytest.mark.parametrize("shape, anchors", [("pulse", "14"), ("switching", "3")])
+def test_what_switches_is_taken_out_of_each_flight(shape, anchors):
+    """It hides what flights share, in the air; a flight without it stays as it is."""
+    rng = np.random.default_rng(7)
     clean = [replace(clean_flight(seed, 40.0), name=f"flight-{seed}") for seed in (31, 32)]
     recorded = []
-    for flight, begin in zip(clean, (1.0, 5.5)):
-        for anchor in ("1", "4"):
-            knots = (begin, begin + 2.9, begin + 9.2)
-            late = {f"{anchor}.c1": 0.5}
-            pulse = SmoothTerm(late, covariate="time", form="anchor", knots=knots, shape="pulse")
-            flight = pulse.inject(flight)
+    for flight in clean:
+        for effect in switching(rng, shape, anchors):
+            flight = effect.inject(flight)
         recorded.append(flight)
-    found, pulses = repairing.without_pulses([*recorded, clean[0]], GroundTruth(), EffectSet())
-    assert [name for name, _ in pulses] == ["flight-31", "flight-32"]
+    found, named = repairing.without_switching([*recorded, clean[0]], GroundTruth(), EffectSet())
+    assert [name for name, _ in named] == ["flight-31", "flight-32"]
     for before, after, right in zip(recorded, found, clean):
-        errors = [np.mean(np.abs(one.tdoa.d - right.tdoa.d)) for one in (before, after)]
+        air = np.abs(right.tdoa.t - 20.0) < 14.0
+        errors = [np.abs(one.tdoa.d - right.tdoa.d)[air].mean() for one in (before, after)]
         assert errors[1] < 0.25 * errors[0]
     assert found[2] is clean[0]
+
+
+@pytest.mark.slow
+def test_an_obstacle_at_a_place_does_not_switch():
+    """It makes an anchor late at times, too, but other flights have it at the same place."""
+    flight = clean_flight(31, 40.0)
+    x, y, z = np.median(flight.truth.p, axis=0) + [0.8, 0.0, 0.0]
+    place = {"3.x": x, "3.y": y, "3.z": z, "3.radius": 1.2, "3.delay": 0.5}
+    blocked = EFFECTS["nlos"](place).inject(flight)
+    (found,), named = repairing.without_switching([blocked], GroundTruth(), EffectSet())
+    assert found is blocked and not named

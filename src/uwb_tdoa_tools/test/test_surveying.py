@@ -710,6 +710,21 @@ def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alo
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "effect, change",
+    [
+        (EFFECTS["anchor_delay"]({"3": 0.28}), r"anchor 3 is later than it was by \+2[678]\."),
+        (EFFECTS["anchor_position"]({"3.x": 0.3, "3.y": -0.2}), r"anchor 3 has moved by \+"),
+    ],
+)
+def test_one_late_anchor_is_no_moved_one(effect, change):
+    flights = [flight_with(effect, seed=seed, make=all_tdoas) for seed in (100, 101)]
+    found = self_calibrate(flights, Tape(std=0.03))
+    assert found.why_not is None and len(found.changes) == 1
+    assert re.match(change, found.changes[0].as_text())
+
+
+@pytest.mark.slow
 def test_who_asks_makes_no_difference(late, diagnosis):
     written = {effect.name: effect.values for effect in diagnosis.effects.effects}
     for effect in late.found(late.shifts):

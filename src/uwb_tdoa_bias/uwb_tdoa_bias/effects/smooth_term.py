@@ -72,13 +72,14 @@ NARROW = {"range": 1.0, "bearing": 0.5, "elevation": 0.5}
 MOST_PARTS = 3  # anchors or pairs whose functions are described
 # {shape: (knots, coefficients)}. Knots are the ends, and points between them where a part begins or
 # ends. The knots of a wave are one period apart. Those of a pulse are its start, its end, and the
-# start of the next one.
+# start of the next one. Between its ends, switching has any number of knots (None).
 SHAPES = {
     "line": (2, 2),
     "beyond": (3, 2),
     "below": (3, 2),
     "step": (3, 2),
     "interval": (4, 2),
+    "switching": (None, 2),
     "pulse": (3, 2),
     "wave": (2, 3),
     "parabola": (2, 3),
@@ -474,9 +475,9 @@ def _rising(setting: str, knots: Any, shape: str) -> tuple[float, ...]:
         out = tuple(float(knot) for knot in knots)
     except (TypeError, ValueError):
         out = ()
-    count = SHAPES[shape][0] if shape in SHAPES else max(len(out), 2)
-    if len(out) != count or not (np.diff(out) > 0.0).all():
-        expected = count if shape in SHAPES else "two or more"
+    count = SHAPES[shape][0] if shape in SHAPES else None
+    if len(out) != (count or max(len(out), 2)) or not (np.diff(out) > 0.0).all():
+        expected = count or "two or more"
         raise InputError(
             f"effects: smooth_term: {setting}: {knots!r} are not {expected} rising numbers, "
             f"as the shape {shape} needs."
@@ -503,7 +504,7 @@ def shape_basis(shape: str, knots: Sequence[float] | np.ndarray, values: np.ndar
     The first is 1, the level. The second is, for
     line, parabola : a rise from -1/2 to 1/2 between the knots; a parabola has its square too
     beyond, below : a rise from 0 at the middle knot to 1 at the last, or at the first
-    step, interval : 1 beyond the middle knot, or between the two inner knots
+    step, interval, switching : 1 beyond the first inner knot, up to the second, and so on
     pulse : 1 from the first knot to the second, and again from the third
     wave : the sine of the period between the knots, and the cosine
     """
@@ -522,11 +523,11 @@ def shape_basis(shape: str, knots: Sequence[float] | np.ndarray, values: np.ndar
     elif shape == "below":
         second = np.maximum(knots[1] - held, 0.0) / (knots[1] - low)
     elif shape == "pulse":
-        within = np.remainder(v - knots[0], knots[2] - knots[0]) < knots[1] - knots[0]
-        second = np.where(np.isnan(v), np.nan, 1.0 * within)
+        since = np.remainder(v - knots[0], knots[2] - knots[0])
+        second = np.where(np.isnan(v), np.nan, 1.0 * (since < knots[1] - knots[0]))
     else:
-        inside = (v >= knots[1]) & (v < knots[2] if shape == "interval" else True)
-        second = np.where(np.isnan(v), np.nan, 1.0 * inside)
+        beyond = [1.0 * (v >= knot) for knot in knots[1:-1]]
+        second = np.where(np.isnan(v), np.nan, sum(beyond[::2]) - sum(beyond[1::2]))
     return np.stack([np.ones_like(second), second], axis=-1)
 
 
@@ -669,9 +670,13 @@ def described(term: SmoothTerm, part: str = "") -> str:
     size = term.values.get(f"{prefix}c1", 0.0)
     std = term.std.get(f"{prefix}c1")
     if term.shape in ("step", "interval"):
-        words = WHEN if name == "time" else WHERE
-        where = words[term.shape].format(*knots, name=name)
-        return _off(term, part, size, std, f" {where}{seen}")
+        words = (WHEN if name == "time" else WHERE)[term.shape]
+        return _off(term, part, size, std, f" {words.format(*knots, name=name)}{seen}")
+    if term.shape == "switching":
+        late = np.diff(term.knots[1:])[::2]
+        share = f"{100.0 * late.sum() / (term.knots[-1] - term.knots[0]):.0f} % of the {name}"
+        pieces = f"{len(late)} pieces of {' to '.join(_in_words('time', [late.min(), late.max()]))}"
+        return _off(term, part, size, std, f" for {share}, in {pieces}")
     if term.shape == "pulse":
         on, period = _in_words(term.covariate, np.subtract(term.knots[1:], term.knots[0]))
         where = f" for {on} in each {period} of {name}, first at {knots[0]}{_factor_clause(term)}"
@@ -683,10 +688,9 @@ def described(term: SmoothTerm, part: str = "") -> str:
             reach = {"line": "", "beyond": " or less", "below": " or more"}[term.shape]
             where = f" where {name} is {knots[last]} than where it is {knots[first]}{reach}"
             return _off(term, part, size, std, f"{where}{seen}")
-        error = None if std is None else std / abs(width)
         side = {"line": "", "beyond": f", above {knots[1]}", "below": f", below {knots[1]}"}
         how = f" for each {unit or 'unit'} more of {name}{side[term.shape]}{seen}"
-        return _off(term, part, size / width, error, how)
+        return _off(term, part, size / width, None if std is None else std / abs(width), how)
     at = np.linspace(term.knots[0], term.knots[-1], 60)
     course = term.curve(at, prefix)
     top, bottom = int(np.argmax(course)), int(np.argmin(course))

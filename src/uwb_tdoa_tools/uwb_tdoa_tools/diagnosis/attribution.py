@@ -271,7 +271,7 @@ class EffectSearch:
             refused += start.refused
             selection = self._validated(self._resumed(start.selection), refused)
         if self._undeclared and len(self.names) >= FOR_MAPS:
-            selection = with_maps(selection, self._smooth, refused)
+            selection = with_maps(selection, self._smooth)
         labels = {one.label for one in selection.chosen}
         refused = [one for one in refused if one.what not in labels]
         return Attribution(
@@ -309,19 +309,6 @@ class EffectSearch:
             floor=floor,
             floor_names=tuple(name for name, _ in near),
         )
-
-    def pulses(self) -> Selection:
-        """Return the pulses that recur in these residuals, beside other effects.
-
-        Functions are searched only if a pulse is among the best beside declared effects.
-        """
-        table = self._unmoved
-        found = select(table, self.declared, self.inflation, self.search)
-        scan = self._scan_of(table)
-        if any(map(_is_pulse, scan(table, found.fit, found.chosen))):
-            found = select(table, self.declared, self.inflation, self.search, scan, found.chosen)
-            found = cross_validated(found, [])
-        return found.kept([one for one in found.chosen if _is_pulse(one)])
 
     @property
     def search(self) -> Search:
@@ -564,11 +551,6 @@ def _smooth(
         for term in channel.smooth_terms(parts) if parts else ():
             out += candidates_of(term, *installation)[:1]
     return out
-
-
-def _is_pulse(candidate: Candidate) -> bool:
-    functions = [term.function for term in candidate.terms]
-    return all(one is not None and one.shape == "pulse" for one in functions)
 
 
 def _is_large(candidate: Candidate, selection: Selection) -> bool:

@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.special import stdtrit
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
@@ -29,9 +30,11 @@ from ..clock import numbered
 from ..parallel import MapFunction
 from ..scoring.metrics import (
     EVERYTHING,
+    LOSS,
     NO_DIFFERENCE,
     Score,
     clear_change,
+    gain,
     nis,
     pooled,
     radio_residuals,
@@ -42,6 +45,9 @@ Spans = tuple[tuple[float, float], ...]  # (first, last) s
 
 BOOTSTRAPS = 400  # number of bootstrap samples
 Z95 = 1.96  # standard deviations, half of a 95 % interval
+# Prior of the spread of the logarithm of error after over before between flights: standard deviation,
+# and how many flights it counts for.
+SPREAD, SPREAD_FLIGHTS = 0.2, 4
 # Standard deviations by which a gain must exceed 0 if the reference itself has errors. Fitted
 # effects follow the common error of the references in any direction: chi distribution with three
 # degrees of freedom, 99.9 %.
@@ -106,13 +112,13 @@ def compare(
     A side is {"runs": [...], "pooled": {...}, "scores": [Score]}. Keys are those of evaluate,
     phases included. Further keys are residual_spread (m, 1.48 MAD of the innovations) and
     rmse_3d_ci (95 %, bootstrap over blocks of 5 s). rmse_3d_gain_ci includes errors of the
-    references that are common to a flight.
+    references that are common to a flight. rmse_3d_gain_elsewhere is of another flight.
 
     shift_std : as of a Reference; map_function : as of `attribute`
     """
     sides = _both_sides(cases, baseline, progress, map_function)
     before, after = (_side(runs) for runs in sides)
-    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(before, after, shift_std)
+    after["pooled"].update(_intervals(before, after, shift_std))
     return before, after
 
 
@@ -128,7 +134,7 @@ def with_config(
     before : side of `compare` that the gain is counted from; shift_std, map_function : as there
     """
     after = _side(zip(cases, map_function(partial(_run, config), cases)))
-    after["pooled"]["rmse_3d_gain_ci"] = _gain_interval(before, after, shift_std)
+    after["pooled"].update(_intervals(before, after, shift_std))
     return after
 
 
@@ -221,6 +227,10 @@ def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> 
         )
     if change == 0:
         return f"together they make {NO_DIFFERENCE} ({much})"
+    for old, new in zip(before.get("runs", ()), after.get("runs", ())):
+        if gain(old["rmse_3d"], new["rmse_3d"]) < -LOSS:
+            worse = f"{100 * old['rmse_3d']:.1f} -> {100 * new['rmse_3d']:.1f} cm"
+            return f"together they make the error larger on a part of {old['flight']} ({worse})"
     return None
 
 
@@ -292,6 +302,28 @@ def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(power.sum(axis=1), 0.0) / np.maximum(count.sum(axis=1), 1))
 
 
+def _intervals(
+    before: dict[str, Any], after: dict[str, Any], shift_std: Callable[[str], np.ndarray]
+) -> dict[str, list[float] | None]:
+    """Return 95 % intervals of the gain: of the mean of these flights, and of another flight.
+
+    Logarithms of the error after over before are normal over flights, with unknown mean and spread
+    (Gelman et al., Bayesian Data Analysis, section 3.3).
+    """
+    ratios: dict[str, list[float]] = {}
+    for old, new in zip(before["runs"], after["runs"]):
+        ratio = np.log(max(new["rmse_3d"], 1e-9) / max(old["rmse_3d"], 1e-9))
+        ratios.setdefault(old["flight"], []).append(ratio)
+    each = np.array([np.mean(several) for several in ratios.values()])
+    freedom, n = SPREAD_FLIGHTS + len(each) - 1, len(each)
+    spread = np.sqrt((SPREAD_FLIGHTS * SPREAD**2 + n * np.var(each)) / freedom)
+    half = stdtrit(freedom, 0.975) * spread * np.sqrt(1.0 + 1.0 / n)
+    return {
+        "rmse_3d_gain_ci": _gain_interval(before, after, shift_std),
+        "rmse_3d_gain_elsewhere": (1.0 - np.exp(each.mean() + [half, -half])).tolist(),
+    }
+
+
 def _gain_interval(
     before: dict[str, Any], after: dict[str, Any], shift_std: Callable[[str], np.ndarray]
 ) -> list[float] | None:
@@ -313,8 +345,7 @@ def _gain_interval(
     of_case = [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, each)]
     shifts = np.concatenate(of_case, axis=1)
     # The same random seed draws the same blocks for both sides.
-    gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
-    return _quantiles(gain)
+    return _quantiles(1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12))
 
 
 def _quantiles(draws: np.ndarray) -> list[float] | None:

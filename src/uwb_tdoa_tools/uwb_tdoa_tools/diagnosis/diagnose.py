@@ -29,7 +29,7 @@ from .detectors import Detection
 from .findings import EffectFinding, Refused, usable
 from .noise import DECIMALS
 from .references import GroundTruth, Reference
-from .refinement import effects_of, written
+from .refinement import written
 from .regression.confounding import Unobservable, unobservable
 from .regression.terms import Candidate
 from .result import Diagnosis
@@ -37,7 +37,6 @@ from .self_calibration import SelfCalibration, Tape, self_calibrate
 from .self_calibration.equations import measured_noise
 from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
-from .single_axes import beside, functions_of_axes
 
 Flights = tuple[Flight, ...]
 
@@ -108,12 +107,10 @@ def diagnose(
     )
     sound, rest = repairing.sound(fitted, base, repairs)
     if reference.tells_errors:
-        pulsing = work.saying("looking for pulses of each flight")
-        steady, pulses = repairing.without_pulses(sound, reference, rest, config, pulsing)
-        found, selected = _with_functions_of_axes(
-            work, steady, rest, *_searched(work, steady, rest)
-        )
-        found = replace(found, alone=(*pulses, *found.alone))
+        looking = work.saying("looking for what switches in each flight")
+        steady, switching = repairing.without_switching(sound, reference, rest, config, looking)
+        found, selected = _searched(work, steady, rest)
+        found = replace(found, alone=(*switching, *found.alone))
         outcome = _by_error(work, found, selected, fitted, held_out, repairs)
     else:
         search = work.search(sound, rest)
@@ -308,53 +305,6 @@ def _searched(
         others = sorted(names.difference(one.what for one in known))
         refused = (*refused, *known, *(Refused(name, better) for name in others))
         search, found, selected = fewer, other, trial
-
-
-def _with_functions_of_axes(
-    work: _Work,
-    flights: Flights,
-    base: EffectSet,
-    found: Attribution,
-    selected: validation.ValidatedSelection,
-) -> tuple[Attribution, validation.ValidatedSelection]:
-    """Return the result of `_searched` with functions of single axes of sensors.
-
-    They are taken only if the error falls by more than LOSS, so other results do not change.
-    """
-    model = EffectSet((*base.effects, *effects_of(selected.selection)))
-    tracing = work.saying("tracing residuals of single axes")
-    remaining = residuals_of(flights, work.reference, model, tracing, work.map_function)
-    refused: list[Refused] = []
-    functions = functions_of_axes(remaining, refused, tracing)
-    if not functions:
-        return found, selected
-    trial = validation.select_by_error(
-        replace(
-            found,
-            selection=beside(selected.selection, functions),
-            detections=selected.detections,
-        ),
-        flights,
-        comparison.Baseline(base, work.config),
-        work.saying("running the filter without each"),
-        work.map_function,
-        validated=selected.selection.chosen,
-        poses=selected.poses,
-    )
-    if gain(selected.error, trial.error) <= LOSS:
-        return found, selected
-    found = replace(
-        found,
-        selection=beside(found.selection, functions),
-        refused=(*found.refused, *refused),
-    )
-    decided = {one.what for one in trial.refused}
-    earlier = [one for one in selected.refused if one.what not in decided]
-    return found, replace(
-        trial,
-        refused=(*earlier, *trial.refused),
-        worth={**selected.worth, **trial.worth},
-    )
 
 
 def _suspects(found: Attribution, selected: validation.ValidatedSelection) -> list[frozenset[str]]:

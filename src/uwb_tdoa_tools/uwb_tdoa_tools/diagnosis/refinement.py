@@ -251,9 +251,7 @@ def with_fewer_pairs(selection: Selection, declared: Sequence[Candidate]) -> Sel
     return selection
 
 
-def with_maps(
-    selection: Selection, smooth: Sequence[Candidate], refused: list[Refused]
-) -> Selection:
+def with_maps(selection: Selection, smooth: Sequence[Candidate]) -> Selection:
     """Return the Selection with functions of the place of each anchor, if hold-out data agree.
 
     Each function alone is too weak to be selected; together they must gain clearly.
@@ -272,14 +270,6 @@ def with_maps(
             and min(score.t for score in scores) > MAPS_SURE
         ):
             selection = trial
-        elif min(scores).gain > 0.0:
-            worth_it = 0.5 * min(scores).gain
-            refused.append(
-                Refused(
-                    maps.label,
-                    f"does not help held-out data enough (log-likelihood {worth_it:.1f})",
-                )
-            )
     return selection
 
 

@@ -14,13 +14,15 @@ from uwb_tdoa_bias.effects import Effect, EffectSet, LabelEffect
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from ..checking.pair_rules import KnownPath, repairs
-from .attribution import Attribution, EffectSearch
+from .attribution import Attribution, residuals_of
 from .comparison import Baseline, ValidationCase, score
-from .detectors import Detection
+from .detectors import Detection, switching
 from .references import Reference
 from .refinement import effects_of
-from .regression.select import Selection
-from .regression.terms import Candidate
+from .regression.fit import fit
+from .regression.select import Selection, select
+from .regression.table import table_of
+from .regression.terms import Candidate, columns_of
 from .validation import TRIAL_FLIGHTS, WORSE, ValidatedSelection
 
 
@@ -61,29 +63,32 @@ def sound(
     return corrected, replace(base, effects=rest)
 
 
-def without_pulses(
+def without_switching(
     flights: Sequence[Flight],
     reference: Reference,
     base: EffectSet,
     config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> tuple[tuple[Flight, ...], tuple[tuple[str, Selection], ...]]:
-    """Return Flights without their pulses, and ((name of a flight, Selection of its pulses), ...).
+    """Return Flights without what switches, and ((name of a flight, Selection of it), ...).
 
-    A pulse recurs with a phase of its own in each flight. Other flights do not have it, but it
-    hides what they have. It is taken out if that improves the filter in this flight. A single
-    flight keeps its pulses.
+    An anchor switches between two levels at times of each flight, or in pulses. Other flights do
+    not have it, but it hides what they have. It is taken out if that improves the
+    filter in this flight.
     """
-    if len(flights) < 2:
-        return tuple(flights), ()
     out, found = [], []
-    for flight in flights:
-        selection = EffectSearch([flight], reference, base, progress=progress).pulses()
-        less = flight
-        for effect in effects_of(selection):
-            values = {key: -value for key, value in effect.values.items()}
-            less = replace(effect, values=values).inject(less)
-        if selection.chosen:
+    for flight, residuals in zip(flights, residuals_of(flights, reference, base, progress)):
+        table, less = table_of([residuals]), flight  # sparse: with many anchors
+        if switch := [
+            one for part in table.tdoa_parts if not table.sparse for one in switching(part)
+        ]:
+            table = table.with_terms([one.terms[0] for one in switch])
+            inflation = fit(table, columns_of(switch), covariance=False).inflation
+            selection = select(table, [], inflation, start=switch)
+            for effect in effects_of(selection):
+                # The level, c0, is a delay, which other flights have too.
+                values = {k: -v for k, v in effect.values.items() if not k.endswith("c0")}
+                less = replace(effect, values=values).inject(less)
             errors = [_error([one], base.effects, config, progress) for one in (flight, less)]
             if errors[1] < errors[0] * (1.0 - WORSE):
                 found.append((flight.name, selection))

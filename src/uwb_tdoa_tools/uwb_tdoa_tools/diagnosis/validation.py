@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import chain, cycle
@@ -156,7 +156,6 @@ def select_by_error(
     baseline: Baseline,
     progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
-    validated: Collection[Candidate] = (),
     poses: Sequence[FixedPoses | None] = (None,),
 ) -> ValidatedSelection:
     """Return the ValidatedSelection of effects that do not make the filter worse on hold-out data.
@@ -168,7 +167,7 @@ def select_by_error(
     may get worse by an effect. Events at a time are tried for their worth, but not kept: another
     flight does not have them at the same time.
 
-    map_function : as of `attribute`; validated : Candidates that stay without another trial
+    map_function : as of `attribute`
     poses : of an earlier ValidatedSelection of these flights, for the first corrections
     """
     candidates, refused = list(attribution.selection.chosen), []
@@ -178,7 +177,7 @@ def select_by_error(
     worth: dict[Candidate | Detection, float] = {}
     misleading: set[str] = set()
     error = trials.start(candidates, detections)
-    while applicable := [one for one in _applicable(candidates) if one not in validated]:
+    while applicable := _applicable(candidates):
         displacements = trials.displacements(candidates, applicable)
         gone = _dropped(displacements, applicable)
         if not gone:

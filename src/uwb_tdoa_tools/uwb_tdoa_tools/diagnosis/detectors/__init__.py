@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Searches for effects that linear regression does not find, by family of effects."""
 
-from .anchor import NlosDetector
+from .anchor import NlosDetector, switching
 from .auxiliary import FloorStepDetector, VelocitySlipDetector
 from .base import Detection, Detector
 from .floor import FloorMultipathDetector
@@ -21,4 +21,4 @@ DETECTORS = {
     )
 }
 
-__all__ = ["DETECTORS", "Detection", "Detector"]
+__all__ = ["DETECTORS", "Detection", "Detector", "switching"]

@@ -135,7 +135,7 @@ def select(
     Parameters
     ----------
     table : RegressionTable
-        It holds the columns of the candidates.
+        It holds the columns of `candidates`.
     candidates : list of Candidate
         Candidates that every step scores.
     inflation : (groups,)
@@ -151,6 +151,7 @@ def select(
         It is called every few seconds.
     """
     chosen = list(start)
+    table = table.with_terms([term for one in chosen for term in one.terms])
     model = fit(table, columns_of(chosen), inflation)
     for _ in range(MAX_STEPS):
         scanned, even = (scan(table, model, chosen), scan.even) if scan else ([], np.empty(0))

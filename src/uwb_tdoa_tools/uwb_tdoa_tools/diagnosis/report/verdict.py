@@ -430,6 +430,8 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
             f"On other flights, expect {OF_OTHERS} of this gain, and {WORSE_OF_OTHERS} to get "
             "worse by 5 % or more. Diagnose three flights or more together to avoid that."
         )
+    if elsewhere := diagnosis.after["pooled"].get("rmse_3d_gain_elsewhere"):
+        out.append(f"The 95 % interval of the gain of another flight is {percent(elsewhere)}.")
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     return out

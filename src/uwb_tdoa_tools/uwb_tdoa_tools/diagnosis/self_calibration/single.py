@@ -10,7 +10,7 @@ the others give, and the filter runs again. All innovations count, also rejected
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 import itertools
@@ -143,14 +143,8 @@ def place(
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)
     positions = anchors.positions.copy()
-    # the ground truth is not read
-    paths = [smooth(flight.among(known).without("truth"), config).odometry for flight in flights]
     low, high = positions[known].min(axis=0) - BEYOND, positions[known].max(axis=0) + BEYOND
-    for row in rows:
-        parts = [
-            _distances(flight, path, row, known, positions) for flight, path in zip(flights, paths)
-        ]
-        tag, distance = (np.concatenate(arrays) for arrays in zip(*parts))
+    for row, (tag, distance) in zip(rows, _distances(flights, rows, config)):
         if len(tag) < FEWEST:
             raise InputError(
                 f"--unknown {anchors.ids[row]}: {len(tag)} TDOAs tell of it, {FEWEST} are "
@@ -171,7 +165,34 @@ def place(
     return anchors.at(positions)
 
 
+def lateness(flights: Sequence[Flight], row: int, config: FilterConfig | None = None) -> float:
+    """Return by how much an anchor is late at its given place, m, on the path by the others."""
+    ((tag, distance),) = _distances(flights, [row], config)
+    return float(
+        np.median(distance - np.linalg.norm(tag - flights[0].anchors.positions[row], axis=1))
+    )
+
+
 def _distances(
+    flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig | None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the return value of `_of_flight` for each row, of all Flights together.
+
+    The other anchors give the path. The ground truth is not read.
+    """
+    anchors = flights[0].anchors
+    known = np.setdiff1d(np.arange(len(anchors)), rows)
+    paths = [smooth(flight.among(known).without("truth"), config).odometry for flight in flights]
+    for row in rows:
+        parts = [
+            _of_flight(flight, path, row, known, anchors.positions)
+            for flight, path in zip(flights, paths)
+        ]
+        tag, distance = (np.concatenate(arrays) for arrays in zip(*parts))
+        yield tag, distance
+
+
+def _of_flight(
     flight: Flight, path: Odometry, row: int, known: np.ndarray, positions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return positions of the tag, (n, 3) m, and measured distances to the anchor `row`, (n,) m.

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
+from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, ChangeKey, changes_of, eliminated, keys_of
 
 from ...checking.pair_rules import MANY
 from ...parallel import MapFunction
@@ -24,7 +24,7 @@ from ..constraints import Constraint
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Equations, Runs
 from .prior import ANYWHERE, TAG_DELAY, Prior, Solution, Tape, solve, to_keep, with_calibration
-from .single import PLACED_STD, Misfit, place
+from .single import PLACED_STD, Misfit, lateness, place
 
 LEAST = 30.0  # s in the air, fewest; fewer do not show how correlated errors are
 SAME_PLACE = 0.05  # m, largest difference of an anchor between flights of one installation
@@ -248,7 +248,8 @@ def self_calibrate(
     """Return the SelfCalibration of Flights. Ground truth is not used.
 
     The coordinates with the smallest std define the frame. Each anchor is also tried as the only
-    moved one, as with `Tape.unknown`, before its error is spread. Raises InputError for flights
+    moved one, as with `Tape.unknown`, before its error is spread, and the likeliest one as the only
+    late one. Raises InputError for flights
     with different anchors, flights that are too short, and a Tape that does not fit.
 
     Parameters
@@ -281,13 +282,19 @@ def self_calibrate(
     if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
         return spread
     misfit, of_spread = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
-    found: dict[int | None, SelfCalibration] = {None: spread}
-    for row, placed in misfit.suspects(base, progress, map_function).items():
+    found: dict[ChangeKey | None, SelfCalibration] = {None: spread}
+    suspects = misfit.suspects(base, progress, map_function)
+    for row, placed in suspects.items():
         unknown = replace(tape, unknown=(spread.prior.ids[row],))
         try:
-            found[row] = _alone(spread, calibrated((unknown, placed)))
+            found[POSITION, row] = _alone(spread, calibrated((unknown, placed)))
         except InputError:  # too few anchors are left
             continue
+    for row in list(suspects)[:1]:
+        later = np.eye(len(spread.prior.ids))[row] * lateness(flights, row, config)
+        effect = AnchorDelay({spread.prior.ids[row]: float(later[row])})
+        one = calibrated((tape, None), base=with_calibration(base, (effect,), None))
+        found[DELAY, row] = _alone(spread, replace(one, delays=one.delays + later))
     return _most_probable(found, misfit, of_spread)
 
 
@@ -373,58 +380,66 @@ def _in_model(found: SelfCalibration) -> EffectSet:
 
 
 def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
-    """Return a SelfCalibration of one unknown anchor, with the prior of the spread solution."""
+    """Return a SelfCalibration of one changed anchor, with the prior of the spread solution."""
     return replace(
         found, given=spread.given, prior=spread.prior, before=spread.before, base=spread.base
     )
 
 
 def _most_probable(
-    found: dict[int | None, SelfCalibration], misfit: Misfit, of_spread: float
+    found: dict[ChangeKey | None, SelfCalibration], misfit: Misfit, of_spread: float
 ) -> SelfCalibration:
     """Return the most probable of several SelfCalibrations.
 
-    A single moved anchor must be ODDS times more probable than the error spread over all anchors,
-    and its shift significant. It must also leave few slow innovations, as any result that may be
+    A single changed anchor must be ODDS times more probable than the error spread over all anchors,
+    and its change significant. It must also leave few slow innovations, as any result that may be
     used: errors of antennas and obstacles are no shift, but one anchor can absorb part of them.
 
-    found : {row of the anchor tried alone, None for the spread solution: SelfCalibration}
+    found : {(effect, row) of the only changed anchor, None for the spread solution: SelfCalibration}
     of_spread : the Misfit of the spread solution
     """
     alike = SYSTEMATIC * max(1.0, min(one.inflation for one in found.values()))
-    evidence: dict[int | None, float] = {None: _log_evidence(found[None], None) - of_spread / alike}
-    for row, one in found.items():
-        if row is not None and one.why_not is None and _stands_elsewhere(one, row):
-            of_one = misfit.of(one.surveyed, _in_model(one))
-            evidence[row] = _log_evidence(one, row) - of_one / alike
-    best = max(evidence, key=evidence.__getitem__)
-    doubt = evidence[best] - np.log(ODDS)
-    if best is None or evidence[None] > doubt:
+    likelihood: dict[ChangeKey | None, float] = {None: -of_spread}
+    for key, one in found.items():
+        if key is not None and one.why_not is None and _is_plain(one, key):
+            likelihood[key] = -misfit.of(one.surveyed, _in_model(one))
+    volume = {key: _log_evidence(found[key], key) for key in likelihood}
+    evidence = {key: volume[key] + likelihood[key] / alike for key in volume}
+    likely = [key for key in evidence if key and evidence[key] > evidence[None] + np.log(ODDS)]
+    if not likely:
         return found[None]
-    likely = {row: value for row, value in evidence.items() if row is not None and value > doubt}
-    return _with_rivals(found, best, likely)
+    # Independent innovations decide between a shift and a delay, and are too sure to refuse one.
+    same = [key for key in evidence if key and key[1] in {row for _, row in likely}]
+    best = max(same, key=lambda key: volume[key] + likelihood[key])
+    most = max(evidence[key] for key in likely)
+    rivals = {key: evidence[key] for key in likely if evidence[key] > most - np.log(ODDS)}
+    return _with_rivals(found, best, {**rivals, best: most})
 
 
-def _stands_elsewhere(found: SelfCalibration, row: int) -> bool:
-    """Return whether the shift of an anchor exceeds PLAINLY standard deviations."""
-    places = slice(3 * row, 3 * row + 3)
-    covariance, shift = found.solution.covariance[places, places], found.shifts[row]
-    return bool(shift @ np.linalg.solve(covariance, shift) > PLAINLY**2)
+def _is_plain(found: SelfCalibration, key: ChangeKey) -> bool:
+    """Return whether the change of an anchor exceeds PLAINLY standard deviations."""
+    places, _ = changes_of(len(found.prior.ids))[key]
+    covariance, change = found.solution.covariance[np.ix_(places, places)], found.offset[places]
+    return bool(change @ np.linalg.solve(covariance, change) > PLAINLY**2)
 
 
-def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
+def _log_evidence(found: SelfCalibration, alone: ChangeKey | None) -> float:
     """Return the log-evidence of a SelfCalibration without the likelihood (Laplace approximation).
 
-    alone : row of the anchor that was unknown, or None
+    alone : change of the only changed anchor, or None
     """
     prior = found.prior.covariance.copy()
     if not found.prior.known.any():
         prior = found.prior.with_delays(found.solution.delay_std)
-    free = {found.prior.ids.index(one.anchor) for one in found.changes if one.effect == POSITION}
-    for row in free if alone is None else {alone, *free}:
-        places = slice(3 * row, 3 * row + 3)
+    free = {
+        (one.effect, found.prior.ids.index(one.anchor))
+        for one in found.changes
+        if one.effect == POSITION
+    }
+    for key in free if alone is None else {alone, *free}:
+        places, _ = changes_of(len(found.prior.ids))[key]
         prior[places], prior[:, places] = 0.0, 0.0
-        prior[places, places] = ANYWHERE**2 * np.eye(3)
+        prior[places, places] = ANYWHERE**2
     # Laplace: half of log|posterior| - log|prior| - squared distance from the prior mean.
     posterior_volume = np.linalg.slogdet(found.solution.covariance)[1]
     prior_volume = np.linalg.slogdet(prior)[1]
@@ -434,26 +449,28 @@ def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
 
 
 def _with_rivals(
-    found: dict[int | None, SelfCalibration], best: int, likely: dict[int, float]
+    found: dict[ChangeKey | None, SelfCalibration], best: ChangeKey, likely: dict[ChangeKey, float]
 ) -> SelfCalibration:
     """Return the best of several SelfCalibrations, with its rivals.
 
     The covariance is the mixture covariance of all likely ones about the best.
 
-    likely : {row: log-evidence}
+    likely : {change of an anchor: log-evidence}
     """
     one = found[best]
     covariance, total = np.zeros_like(one.solution.covariance), 0.0
-    for row, value in likely.items():
-        weight, off = np.exp(value - likely[best]), found[row].offset - one.offset
-        covariance = covariance + weight * (found[row].solution.covariance + np.outer(off, off))
+    for key, value in likely.items():
+        weight, off = np.exp(value - likely[best]), found[key].offset - one.offset
+        covariance = covariance + weight * (found[key].solution.covariance + np.outer(off, off))
         total += weight
     solution = replace(one.solution, covariance=covariance / total)
-    places = slice(3 * best, 3 * best + 3)
-    others = tuple(one.prior.ids[row] for row in likely if row != best)
+    (effect, row), ids = best, one.prior.ids
+    places = changes_of(len(ids))[best][0]
+    rivals = tuple(other for other, at in likely if at == row and other != effect)
+    others = tuple(dict.fromkeys(ids[at] for _, at in likely if at != row))
     std = np.sqrt(np.diag(solution.covariance))[places]
-    change = AnchorChange(POSITION, one.prior.ids[best], one.shifts[best], std, (), others)
-    return replace(one, solution=solution, changes=(change, *one.changes))
+    changed = AnchorChange(effect, ids[row], one.offset[places], std, rivals, others)
+    return replace(one, solution=solution, changes=(changed, *one.changes))
 
 
 def same_anchors(flights: Sequence[Flight]) -> None:
