@@ -10,6 +10,7 @@ import pytest
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Tdoas
 from uwb_tdoa_bias.common.sensors.height import Height
+from uwb_tdoa_bias.common.sensors.velocity import Velocity
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed, set_pose
 from uwb_tdoa_ekf.core.horizon import BEGINS, ENDS
@@ -126,6 +127,21 @@ def test_a_given_pose_is_where_it_goes_on():
         x = state.record.hypotheses[state.record.best].x
         assert np.linalg.norm(x[:3] - place) < 0.7
     assert state.record.horizon.state == RUNNING
+
+
+def test_wheels_without_a_yaw_are_left_out_while_too_few_tdoas_find_it():
+    """With four yaws and 2 TDOAs a second such a rover was 4 m off."""
+    for seed in range(3):
+        flight, p = walk(2.0, seed=seed)
+        t = np.arange(0.0, 40.0, 0.05)
+        forward = np.tile([1.2, 0.0, 0.0], (len(t), 1))
+        std, turning = np.tile([0.02, 0.02, np.inf], (len(t), 1)), np.full(len(t), -1.2 / 2.5)
+        wheels = Velocity(t, forward, std, turning, np.full(len(t), 0.02))
+        driven = flight.replaced(velocity=wheels)
+        for estimate in (run_offline, smooth):
+            odometry = estimate(driven, CONFIG).odometry
+            off = errors_of(odometry, flight, p)
+            assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 1.2
 
 
 @settings(max_examples=20, deadline=None)

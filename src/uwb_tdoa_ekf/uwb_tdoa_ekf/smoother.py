@@ -33,6 +33,7 @@ from .core import auxiliary, horizon, noise, plane, workspace
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
+from .core.initialization import FEWEST_OF_YAW, YAW_SECONDS
 from .core.memory import ODOMETRY, RESIDUAL, USED, joined, new_state, structured
 from .core.state import ERROR_STATES, MOVING_STATES, inject
 from .offline import Run, may_have_offset, run_offline, without_offset, without_unknown_offset
@@ -146,11 +147,14 @@ def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -
 
 
 def _is_alone(flight: Flight, config: FilterConfig) -> bool:
-    """Return whether a tag sends few TDOAs, and no other sensor measures."""
-    others = flight.velocity, flight.range, flight.height, flight.imu if config.use_imu else None
-    held = config.planar or config.fixed_height_std > 0.0
-    few = len(flight.tdoa) < horizon.BEGINS * flight.duration
-    return few and not held and config.adapt_noise and all(other is None for other in others)
+    """Return whether a tag sends few TDOAs, and no other sensor is used."""
+    rate = len(flight.tdoa) / max(flight.duration, 1e-9)
+    imu = flight.imu if config.use_imu else None
+    headless = imu is None and config.initial_yaw_std > YAW_STD
+    velocity = None if headless and rate < FEWEST_OF_YAW / YAW_SECONDS else flight.velocity
+    held = config.planar or config.fixed_height_std > 0.0 or not config.adapt_noise
+    measured = any(other is not None for other in (velocity, flight.range, flight.height, imu))
+    return rate < horizon.BEGINS and not held and not measured
 
 
 def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:

@@ -395,9 +395,11 @@ def _on_sensor(
     if sensor.kind == sensors.RANGE:
         _on_range(ekf, anchors, parameters, sensor, residual, records)
     elif ekf.running and _predict(ekf, parameters, sensor.t, records):
-        opens = not (parameters.use_imu or ekf.velocity.refused)
-        if sensor.kind == sensors.VELOCITY and opens:
-            initialization.open_unknown_yaw(ekf, parameters, records)
+        if sensor.kind == sensors.VELOCITY:
+            if initialization.yaw_stays_unknown(ekf, parameters):
+                return
+            if not (parameters.use_imu or ekf.velocity.refused):
+                initialization.open_unknown_yaw(ekf, parameters, records)
         sensors.observe(ekf, parameters, sensor, residual, records)
     elif sensor.kind == sensors.HEIGHT:
         height.record(ekf, sensor)

@@ -45,6 +45,9 @@ UNKNOWN, BETTER = (2.0, 0.5)
 # longest gap, as a share of the duration of all TDOAs above. A longer gap means that the tag has
 # just been switched on.
 LONGEST_GAP = 0.6
+# s, and least number of TDOAs in it, that find the yaw of a tag with wheels and without an IMU: with 7 a
+# second a rover has 0.13 m, with 5 0.30 m, and 0.19 m without its wheels
+YAW_SECONDS, FEWEST_OF_YAW = (2.0, 12)
 TILT_STD = 0.1  # rad, roll and pitch at the start
 # rad, standard deviation with which hypotheses of all yaws start, with nearly the same weight
 YAW_SEARCH_STD = 2.0 * math.pi
@@ -730,6 +733,18 @@ def turn_yaw(ekf: Record, angle: float, history: np.ndarray) -> None:
     ekf.yaw_test.count += 1
     ekf.attitude_reset = True
     widen(ekf, history)
+
+
+@compiled
+def yaw_stays_unknown(ekf: Record, parameters: Record) -> bool:
+    """Return whether a tag without an IMU has an unknown yaw, and too few TDOAs to find it.
+
+    A velocity in the body frame then leads to a wrong place.
+    """
+    best = ekf.hypotheses[ekf.best]
+    known = hypotheses.followed(ekf) == 1 and best.P[8, 8] <= hypotheses.YAW_STD**2
+    few = len(recent(ekf, YAW_SECONDS)) < FEWEST_OF_YAW
+    return not (parameters.use_imu or known) and few
 
 
 @compiled
