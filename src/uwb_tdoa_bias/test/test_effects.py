@@ -114,8 +114,8 @@ def made(effect, size=0.1, rng=None):
             {"anchor_ids": {"1": 2, "2": 4, "4": 1}, "pair_sign": {"0-1": -1}}[effect.name]
         )
     rng = rng or np.random.default_rng(0)
-    keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.example,)
-    limits = {"1.start": 3.0, "1.end": 9.0} if effect.example.startswith("1.") else {}
+    keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.row.example,)
+    limits = {"1.start": 3.0, "1.end": 9.0} if effect.row.example.startswith("1.") else {}
     sizes = {key: size * min(1.0, effect.bound_of(key)) * rng.uniform(0.5, 1.0) for key in keys}
     return effect({**limits, **sizes})
 
@@ -156,17 +156,17 @@ def samples_of(flight, channel):
 @pytest.mark.parametrize("effect", ALL)
 def test_is_declared_in_full(effect):
     assert EFFECTS[effect.name] is effect
-    assert effect.bound > effect.negligible > 0.0 and effect.prior_std > 0.0
-    assert effect.unit and effect.reference and effect.physics
-    assert set(effect.distinguished_by) <= set(effect.confounded_with) <= set(EFFECTS)
+    assert effect.row.bound > effect.row.negligible > 0.0 and effect.row.prior_std > 0.0
+    assert effect.unit and effect.row.reference and effect.row.physics
+    assert set(effect.row.distinguished_by) <= set(effect.row.confounded_with) <= set(EFFECTS)
     assert set(effect.channels) <= {"tdoa", "gyro", "accel", *STREAM_OF}
     # An effect without parameters changes nothing.
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
-    bound = effect.bound_of(effect.example)
+    bound = effect.bound_of(effect.row.example)
     for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
         with pytest.raises(InputError, match="values"):
-            effect({effect.example: wrong})
+            effect({effect.row.example: wrong})
     for wrong in ("sideways", "0.sideways", "1-2-3", "123456", "²"):
         with pytest.raises(InputError, match=f"effects: {effect.name}: parameter '{wrong}' is not"):
             effect({wrong: 0.1})
@@ -176,10 +176,10 @@ def test_is_declared_in_full(effect):
 def test_is_in_the_document(effect):
     text = DOCUMENT.read_text()
     section = text.partition(f"### {effect.name}\n")[2].partition("\n### ")[0]
-    assert effect.physics in section and effect.reference in section
-    assert all(other in section for other in effect.confounded_with)
+    assert effect.row.physics in section and effect.row.reference in section
+    assert all(other in section for other in effect.row.confounded_with)
     assert (
-        f"| {effect.bound:g} | {effect.prior_std:g} | {effect.negligible:g} |"
+        f"| {effect.row.bound:g} | {effect.row.prior_std:g} | {effect.row.negligible:g} |"
         in text.partition(f"[`{effect.name}`]")[2].split("\n")[0]
     )
 
@@ -286,7 +286,7 @@ def test_a_tdoa_errs_as_the_ranges_whose_difference_it_is(effect, seed):
 @pytest.mark.parametrize("effect", ESTIMATED)
 def test_says_whether_it_uses_the_attitude(effect):
     samples = random_samples(7)
-    keys = effect.groups(samples.anchors, PAIRS)[0] or (effect.example,)
+    keys = effect.groups(samples.anchors, PAIRS)[0] or (effect.row.example,)
     one = effect({key: 0.1 * effect.bound_of(key) for key in keys})
     turned = replace(samples, q=Rotation.random(len(samples), random_state=1).as_quat())
     changed = np.abs(one.bias(samples) - one.bias(turned)).max() > 1e-9
@@ -295,7 +295,7 @@ def test_says_whether_it_uses_the_attitude(effect):
 
 def filled(effect, value, std):
     """Return the effect with the same value for all parameters that a fit may set."""
-    keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.example,)
+    keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.row.example,)
     limits = {"0.x": 1.0, "0.y": -2.0, "0.z": 1.5, "0.radius": 0.6} if effect.name == "nlos" else {}
     return effect({**dict.fromkeys(keys, value), **limits}, dict.fromkeys(keys, std))
 
@@ -634,7 +634,9 @@ def test_an_effect_without_a_sentence_of_its_own_is_advised_on_by_its_physics():
     class Rust(EFFECTS["anchor_delay"]):
         """An effect that a user adds."""
 
-        name, physics, remedy = "rust", "rusty connectors", ""
+        row = replace(
+            EFFECTS["anchor_delay"].row, name="rust", physics="rusty connectors", remedy=""
+        )
 
     (sentence,) = Rust({3: 0.31, 1: 0.001}, {3: 0.01, 1: 0.002}).advice()
     assert (

@@ -220,7 +220,7 @@ def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one
     model = fit(table, columns)
     applied = refit(table, columns, model, share=1.0)
     x, information = table.matrix(columns), model.information(table)
-    prior = np.where(moved, APPLIED_STD, EFFECTS["anchor_delay"].prior_std)
+    prior = np.where(moved, APPLIED_STD, EFFECTS["anchor_delay"].row.prior_std)
     gram = x.T @ (information[:, None] * x) + np.diag(prior**-2.0)
     expected = np.linalg.solve(gram, x.T @ (information * table.y))
     np.testing.assert_allclose(applied.beta, expected, atol=1e-9)

@@ -925,7 +925,7 @@ def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages)
         for name in shown:
             assert TERMS[name] in meanings or TERMS[name.rstrip("s")] in meanings, name
         named = {name for name in EFFECTS if re.search(rf"\b{name}\b", text)}
-        assert all(EFFECTS[name].physics in meanings for name in named)
+        assert all(EFFECTS[name].row.physics in meanings for name in named)
 
 
 def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(result):

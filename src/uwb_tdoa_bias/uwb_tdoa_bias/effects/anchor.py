@@ -314,11 +314,11 @@ class TruthFrame(GeometryEffect):
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        return cls.bound if key in "xyz" else ANGLE_BOUND
+        return cls.row.bound if key in "xyz" else ANGLE_BOUND
 
     @classmethod
     def prior_std_of(cls, key: str) -> float:
-        return cls.prior_std if key in "xyz" else ANGLE_PRIOR_STD
+        return cls.row.prior_std if key in "xyz" else ANGLE_PRIOR_STD
 
     def shown_in(self, key: str) -> tuple[str, float]:
         return ("m", 1.0) if key in "xyz" else ("degrees", math.degrees(1.0))
@@ -402,7 +402,7 @@ class Nlos(SearchedDelay):
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        return UNLIMITED if key.endswith(("start", "end", ".x", ".y", ".z")) else cls.bound
+        return UNLIMITED if key.endswith(("start", "end", ".x", ".y", ".z")) else cls.row.bound
 
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 import math
 import re
@@ -227,21 +227,9 @@ class Effect:
     source: str = ""
     domain: dict[str, tuple[float, float]] = field(default_factory=dict, kw_only=True)
 
-    row: ClassVar[Row]  # its fields become attributes of the class
-    name: ClassVar[str]
+    row: ClassVar[Row]
+    name: ClassVar[str]  # of the row, as the unit
     unit: ClassVar[str]
-    bound: ClassVar[float]
-    negligible: ClassVar[float]
-    prior_std: ClassVar[float]
-    example: ClassVar[str]
-    physics: ClassVar[str]
-    reference: ClassVar[str]
-    confounded_with: ClassVar[tuple[str, ...]] = ()
-    distinguished_by: ClassVar[dict[str, str]] = {}
-    remedy: ClassVar[str] = ""
-    phrase: ClassVar[str]
-    ways: ClassVar[tuple[str, str]]
-    shown: ClassVar[tuple[str, float] | None] = None
 
     # Parameters of a fixed set; None: the example alone. An effect with `key_form` has no fixed set.
     parameters: ClassVar[tuple[str, ...] | None] = None
@@ -276,8 +264,7 @@ class Effect:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if "row" in vars(cls):
-            for part in fields(cls.row):
-                setattr(cls, part.name, getattr(cls.row, part.name))
+            cls.name, cls.unit = cls.row.name, cls.row.unit
 
     def __post_init__(self) -> None:
         for group in ("values", "std"):
@@ -314,12 +301,12 @@ class Effect:
     @classmethod
     def bound_of(cls, key: str) -> float:
         """Return the largest magnitude of the parameter `key`, in its unit."""
-        return cls.bound
+        return cls.row.bound
 
     @classmethod
     def prior_std_of(cls, key: str) -> float:
         """Return the prior standard deviation of the parameter `key`, in its unit."""
-        return cls.prior_std
+        return cls.row.prior_std
 
     @classmethod
     def unit_of(cls, key: str) -> str:
@@ -345,7 +332,7 @@ class Effect:
 
         anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None.
         """
-        return with_each((cls.example,) if cls.parameters is None else cls.parameters)
+        return with_each((cls.row.example,) if cls.parameters is None else cls.parameters)
 
     @property
     def label(self) -> str:
@@ -514,12 +501,12 @@ class Effect:
         significant = self.significant()
         if not significant:
             return ()
-        if self.remedy:
-            return (self.remedy.format(found=self.found(), where=self.where()),)
+        if self.row.remedy:
+            return (self.row.remedy.format(found=self.found(), where=self.where()),)
         largest = list(significant.items())[:LARGEST]
         values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
         return (
-            f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",
+            f"Look for the cause of {self.name}: {self.row.physics} (found: {values}, in {self.unit}).",
         )
 
     def found(self) -> str:
@@ -527,7 +514,7 @@ class Effect:
         order = {key: place for place, key in enumerate(self.groups(None, None)[0])}
         keys = sorted(self.significant(), key=lambda key: order.get(key, 0))
         return listed(
-            self.phrase.format(
+            self.row.phrase.format(
                 size=self.size(key), value=self.signed(key), way=self.way(key), key=key
             )
             for key in keys
@@ -539,11 +526,11 @@ class Effect:
 
     def way(self, key: str) -> str:
         """Return the word of `ways` for the sign of a value."""
-        return self.ways[0] if self.values[key] > 0.0 else self.ways[1]
+        return self.row.ways[0] if self.values[key] > 0.0 else self.row.ways[1]
 
     def shown_in(self, key: str) -> tuple[str, float]:
         """Return (unit, factor) in which reports show a value."""
-        return self.shown or (self.unit, 1.0)
+        return self.row.shown or (self.unit, 1.0)
 
     def size(self, key: str) -> str:
         """Return the magnitude of a value with its standard deviation, as reports show it."""

@@ -56,7 +56,7 @@ class FloorMultipath(SearchedDelay):
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        return UNLIMITED if key in PLACE else cls.bound
+        return UNLIMITED if key in PLACE else cls.row.bound
 
     @classmethod
     def within_bounds(cls, values: dict[str, float]) -> bool:

@@ -43,7 +43,9 @@ class SensorEffect(Effect):
 
     def vector(self) -> np.ndarray:
         """Return the values of its parameters, (k,)."""
-        return np.array([self.values.get(key, 0.0) for key in self.parameters or (self.example,)])
+        return np.array(
+            [self.values.get(key, 0.0) for key in self.parameters or (self.row.example,)]
+        )
 
     def model(self) -> Affine:
         """Return the Affine from true to measured values."""
@@ -458,7 +460,7 @@ class IntervalEffect(Effect):
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        return UNLIMITED if key.endswith(LIMITS) else cls.bound
+        return UNLIMITED if key.endswith(LIMITS) else cls.row.bound
 
     @property
     def merge_key(self) -> tuple[Hashable, ...]:
@@ -489,7 +491,7 @@ class IntervalEffect(Effect):
     def advice(self) -> tuple[str, ...]:
         keys = [key for key in self.significant() if not key.endswith(LIMITS)]
         return tuple(
-            self.remedy.format(found=self.size(key), way=self.way(key), when=self._when(key))
+            self.row.remedy.format(found=self.size(key), way=self.way(key), when=self._when(key))
             for key in keys
         )
 

@@ -185,10 +185,10 @@ class SmoothTerm(Effect):
     def prior_std_of(self, key: str) -> float:  # type: ignore[override]  # of a term
         if self.shape == "spline" and self.form not in OF_LINKS:
             # One function per anchor: many, hence small.
-            return 0.5 * self.prior_std if "." in key else self.prior_std
+            return 0.5 * self.row.prior_std if "." in key else self.row.prior_std
         if self.channel in RADIO:
             return RADIO_PRIOR_STD
-        return PRIOR_STD.get(self.channel.partition(".")[0], self.prior_std)
+        return PRIOR_STD.get(self.channel.partition(".")[0], self.row.prior_std)
 
     @property
     def channels(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term

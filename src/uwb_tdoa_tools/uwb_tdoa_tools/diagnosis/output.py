@@ -111,7 +111,7 @@ def _finding(finding: EffectFinding) -> dict[str, Any]:
             for other in finding.alternatives
             if other.share is not None
         ],
-        "could_be_mistaken_for": list(effect.confounded_with),
+        "could_be_mistaken_for": list(effect.row.confounded_with),
         **_over_flights(finding),
         "added": finding.added,
         "on_floor": finding.on_floor,

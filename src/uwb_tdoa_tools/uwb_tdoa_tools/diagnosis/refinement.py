@@ -239,7 +239,7 @@ def with_fewer_pairs(selection: Selection, declared: Sequence[Candidate]) -> Sel
             continue
         others = [one for one in selection.chosen if one is not group]
         taken = {one.name for one in others}
-        instead = [full[name] for name in effect.confounded_with if name in full.keys() - taken]
+        instead = [full[name] for name in effect.row.confounded_with if name in full.keys() - taken]
         single = [one for one in declared if one.name == group.name and len(one.columns) == 1]
         trials = [
             select(selection.table, single, selection.fit.inflation, start=start)

@@ -441,12 +441,12 @@ def left_out(effect: Effect, anchors: Anchors) -> LeftOut:
 def _unit(effect: Effect) -> str:
     if isinstance(effect, SmoothTerm):
         return SENSOR_UNITS.get(effect.channels[0], "m")
-    return effect.unit_of(effect.example)
+    return effect.unit_of(effect.row.example)
 
 
 def _own(effect: Effect, key: str) -> float:
     """Return a value if it is a size in the first unit of the effect, else 0."""
-    other = effect.is_condition(key) or effect.unit_of(key) != effect.unit_of(effect.example)
+    other = effect.is_condition(key) or effect.unit_of(key) != effect.unit_of(effect.row.example)
     return 0.0 if other else effect.values[key]
 
 

@@ -40,7 +40,7 @@ def parse_effect(name: str, values: Sequence[str]) -> Effect:
     parameters: dict[str, Any] = {}  # the Effect converts the texts
     for text in ",".join(values).split(","):
         key, found, number = text.replace(":", "=").strip().rpartition("=")
-        key = key.strip() if found else kind.example
+        key = key.strip() if found else kind.row.example
         if key in parameters:
             raise InputError(f"--value: {name}: {key} is given twice.")
         parameters[key] = number
@@ -88,7 +88,8 @@ def _check_anchors(effect: Effect, flight: Flight) -> None:
 def catalogue() -> str:
     """List all effects with parameter, unit and physics, as text."""
     lines = [
-        f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()
+        f"{name:20s} e.g. {e.row.example}=NUMBER ({e.unit}): {e.row.physics}"
+        for name, e in EFFECTS.items()
     ]
     return "\n".join(lines)
 

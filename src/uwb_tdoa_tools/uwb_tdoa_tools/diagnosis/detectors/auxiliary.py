@@ -81,7 +81,7 @@ class IntervalDetector(Detector):
         information = model.information(table)[rows]
         score, power = x * information * model.residual[rows], x * x * information
         gain, limits, price = best_interval(
-            table.t[rows], score, power, self.effect.prior_std**-2, signed=True
+            table.t[rows], score, power, self.effect.row.prior_std**-2, signed=True
         )
         if gain <= LEAST_GAIN + price:
             return []

@@ -72,7 +72,9 @@ class FloorMultipathDetector(Detector):
         ]
         trials = _Trials(np.stack(columns), model.residual[rows][low], table.count[rows][low])
         delays, at = trials.best()
-        late = delays > (self.effect.negligible if mine else max(LEAST, GOOD_PART * delays.max()))
+        late = delays > (
+            self.effect.row.negligible if mine else max(LEAST, GOOD_PART * delays.max())
+        )
         late &= HEIGHTS[at] < HEIGHTS[-1]  # an effect above is not of the floor
         if late.sum() < (1 if mine else FEWEST):
             return []

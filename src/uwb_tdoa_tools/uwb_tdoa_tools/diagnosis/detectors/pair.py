@@ -102,7 +102,7 @@ class NoiseCorrelationDetector(Detector):
         power = np.maximum((shape @ covariance) / np.sum(shape**2, axis=1), 0.0)
         best = int(np.argmin(np.sum((covariance - power[:, None] * shape) ** 2, axis=1)))
         std = np.sqrt(0.5 * power[best])
-        if std < self.effect.negligible:
+        if std < self.effect.row.negligible:
             return None
         # Rough standard errors, from simulated flights of one minute.
         errors = {"std": 0.1 * std, "time": 0.3 * TIMES[best]}
@@ -163,7 +163,7 @@ class NoiseLevelDetector(Detector):
             if (
                 s > RATIO * level
                 and s - level > SURE_LEVEL * error
-                and extra > self.effect.negligible
+                and extra > self.effect.row.negligible
             ):
                 key = f"{ids[link // len(ids)]}-{ids[link % len(ids)]}"
                 values[key], std[key] = extra, s * error / max(extra, 1e-9)
@@ -182,7 +182,7 @@ class OutlierRateDetector(Detector):
     def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
         shares = [share for series in series_of(residuals) for share in _shares(series)]
         share, error = float(np.mean(shares)), float(np.std(shares) / np.sqrt(len(shares)))
-        if share - 2.0 * error < self.effect.negligible:
+        if share - 2.0 * error < self.effect.row.negligible:
             return None
         effect = self.effect({"share": share}, {"share": error}, "diagnose")
         return Detection(

@@ -50,7 +50,7 @@ class Unobservable:
 def flight_to_tell(effect: str, other: str) -> str:
     """Return a sentence: the flight that distinguishes two effects, given by name."""
     for name, opposite in ((effect, other), (other, effect)):
-        sentence = EFFECTS[name].distinguished_by.get(opposite) if name in EFFECTS else None
+        sentence = EFFECTS[name].row.distinguished_by.get(opposite) if name in EFFECTS else None
         if sentence:
             return sentence
     return ANY_FLIGHT

@@ -111,7 +111,7 @@ class Candidate:
         If few values are large, a smaller group of parameters suffices.
         """
         effects = [term.effect for term in self.terms for _ in term.keys]
-        worth = [abs(value) >= one.negligible for value, one in zip(beta.tolist(), effects)]
+        worth = [abs(value) >= one.row.negligible for value, one in zip(beta.tolist(), effects)]
         return sum(worth) >= sum(one.sizable_share for one in effects)
 
 

@@ -74,7 +74,7 @@ class Entry:
         """Return the physical cause, in words."""
         first = self.findings[0]
         if first.declared:
-            return first.effect.physics
+            return first.effect.row.physics
         return "structure that no effect of the catalogue explains"
 
     @property
@@ -185,7 +185,7 @@ def doubt_in_words(entry: Entry) -> list[str]:
     first = entry.findings[0]
     imitators = [other for other in entry.alternatives if other.gap is None]
     if not entry.alternatives and not first.candidates:
-        like = first.effect.confounded_with
+        like = first.effect.row.confounded_with
         return [f"not compared; like {listed(like, 'or')}" if like else "not compared"]
     return [
         *_doubts("Could as well be {}; to tell: {}.", entry.undecided),

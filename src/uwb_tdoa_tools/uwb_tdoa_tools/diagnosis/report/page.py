@@ -74,7 +74,7 @@ def meanings(text: str) -> dict[str, str]:
     A plural is explained by its singular.
     """
     effects = {
-        name: f"{effect.physics}."
+        name: f"{effect.row.physics}."
         for name, effect in EFFECTS.items()
         if re.search(rf"\b{name}\b", text)
     }

@@ -474,7 +474,7 @@ def cause(entry: Entry, describe: Callable[[SmoothTerm, str], str] = described) 
         )
         return f"errors that depend on {covariates}, anchor by anchor; the largest: {said}"
     effect = entry.findings[0].effect
-    what, key = effect.physics.partition(":")[0], effect.largest_size()
+    what, key = effect.row.physics.partition(":")[0], effect.largest_size()
     if key is None:
         return f"{what} ({effect.name})"
     unit, factor = for_people(effect.unit_of(key))
