@@ -118,7 +118,7 @@ def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
     topics = ("--wait-matched", "180", "--wait-topics", "uwb/tdoa", "imu/data", "uwb/anchors")
     replay = (
         "-m",
-        "uwb_tdoa_tools.commands",
+        "uwb_tdoa_tools.main",
         "replay",
         tmp_path / "flight.bag",
         "--rate",

@@ -48,7 +48,7 @@ class Process:
     """A running tool of ours, with its lines on stderr."""
 
     def __init__(self, name, *arguments):
-        self.process = programs.start("-m", "uwb_tdoa_tools.commands", name, *arguments)
+        self.process = programs.start("-m", "uwb_tdoa_tools.main", name, *arguments)
         self.said = []
         self._lines = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()

@@ -111,7 +111,7 @@ def silences(name, words, folder):
     stops at the first message after FIRST, or after LONG_ENOUGH.
     """
     out, process = [], None
-    line = [sys.executable, "-m", "uwb_tdoa_tools.commands", name, *words]
+    line = [sys.executable, "-m", "uwb_tdoa_tools.main", name, *words]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
     with subprocess.Popen(line, cwd=folder, start_new_session=True, **pipes) as process:
         selector = selectors.DefaultSelector()

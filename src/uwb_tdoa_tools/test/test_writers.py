@@ -102,7 +102,7 @@ def test_evaluate_reads_and_writes_files_in_an_ascii_locale(tmp_path, encoding):
     bag.parent.mkdir()
     write_bag(replace(clean_flight(100, 16.0), name="flüge"), bag)
     words = ("evaluate", bag, "--json", "é.json", "--plot", "é è.png", "--tum", "ü ü")
-    line = ["-m", "uwb_tdoa_tools.commands", *words]
+    line = ["-m", "uwb_tdoa_tools.main", *words]
     variables = os.environ | ASCII | {"PYTHONIOENCODING": encoding}
     done = python(*line, cwd=tmp_path, env=variables, encoding=encoding)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr

@@ -283,9 +283,9 @@ class StreamInput:
         request 890).
         """
         before, self._number = self._number, number
-        if before is not None and number is not None and number > before + 1:
-            if self.get_publisher_count() == 1:
-                self.lost += number - before - 1
+        missing = 0 if before is None or number is None else number - before - 1
+        if missing > 0 and self.get_publisher_count() == 1:
+            self.lost += missing
 
     def get_publisher_count(self) -> int:
         """Return the number of publishers of the topic."""

@@ -33,6 +33,7 @@ from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
+from uwb_tdoa_bias.common.arrays import Stamped
 from uwb_tdoa_bias.common.errors import InputError, printable, written_by
 from uwb_tdoa_bias.common.flight import Flight, Imu
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS, Sensor
@@ -84,7 +85,7 @@ _PRINTED = ("source", "format", "protocol")  # texts of this meta that are only 
 
 
 @dataclass(frozen=True)
-class RecordedOdometry:
+class RecordedOdometry(Stamped):
     """Recorded estimates, with world and body frame as in nav_msgs/Odometry.
 
     Attributes
@@ -102,9 +103,6 @@ class RecordedOdometry:
     q: np.ndarray
     covariance: np.ndarray
     remarks: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.t)
 
 
 def write_bag(

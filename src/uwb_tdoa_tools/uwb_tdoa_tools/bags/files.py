@@ -454,10 +454,8 @@ def _unpacked(file: Path, folder: Path, budget: Budget, most: int) -> Path:
 
 def _intact(file: Path) -> Iterator[Row]:
     """Yield the messages of a data file up to where it is cut."""
-    try:
+    with suppress(Damaged):
         yield from rows(file)
-    except Damaged:
-        return
 
 
 def _by_stamp(

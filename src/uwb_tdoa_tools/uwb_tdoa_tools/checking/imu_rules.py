@@ -232,9 +232,9 @@ def _is_possible(imu: Imu, gyro: np.ndarray) -> bool:
     """
     if abs(scale_of(gyro) - 1.0) < 0.03:
         return True
-    rates, windows, cutter = imu.gyro @ gyro.T, [], Cutter()
-    for window in cutter.cut(imu.t, np.full(len(imu), np.nan), rates, imu.accel):
-        windows.append(imu_window(*window))
+    rates = imu.gyro @ gyro.T
+    cut = Cutter().cut(imu.t, np.full(len(imu), np.nan), rates, imu.accel)
+    windows = [imu_window(*window) for window in cut]
     fastest = np.quantile(np.linalg.norm(rates, axis=1), 0.99)
     return bool(fastest < FASTEST) and not turn_excess(windows) > TURN_EXCESS
 

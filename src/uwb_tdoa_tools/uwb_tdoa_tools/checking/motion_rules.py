@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from uwb_tdoa_bias.common.arrays import Stamped
 from uwb_tdoa_bias.common.flight import Flight, Imu, Truth
 from uwb_tdoa_bias.common.geometry import tdoa as predicted_tdoa
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
@@ -49,7 +50,7 @@ ATTITUDES = {
 }
 
 
-class TrueMotion:
+class TrueMotion(Stamped):
     """Inertial samples and the motion of the ground truth over the same cells.
 
     Attributes
@@ -92,10 +93,6 @@ class TrueMotion:
         for sensor in SENSORS:
             left = _slowly_left(self.measured[sensor] - self.at(self.true[sensor]), self.block)
             self._scale[sensor] = 1.4826 * np.median(np.abs(left), axis=0) + 1e-9
-
-    def __len__(self) -> int:
-        """Return the number of cells."""
-        return len(self.t)
 
     def with_attitude(self, name: str | None) -> dict[str, np.ndarray]:
         """Return {"gyro", "accel": (n + 2 BEYOND, 3)}, the true readings for one of ATTITUDES.

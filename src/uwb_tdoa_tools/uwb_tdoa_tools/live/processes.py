@@ -69,11 +69,11 @@ def own_domain() -> Iterator[None]:
 
     The domain is drawn at random: in the first free one DDS may still list nodes that ended just now.
     """
-    with domain_id(lambda: random.randint(1, 100)) as number:
-        with variables(
-            {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        ):
-            yield
+    with (
+        domain_id(lambda: random.randint(1, 100)) as number,
+        variables({"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}),
+    ):
+        yield
 
 
 def wait(

@@ -613,11 +613,11 @@ def _without_spare_anchors(
     while len(anchors) > hall.installation.unknowns + 1:
         progress(f"layouts of {len(anchors) - 1} anchors")
         now = quick.with_anchors(anchors).everywhere(points)
-        costs = []
-        for row in range(len(anchors)):
-            judged = quick.changed(now, points, _less(anchors, row), anchors.positions[[row]])
-            costs.append(_cost_of(judged, quick))
-        gone = int(np.argmin(costs))
+        without_one = (
+            quick.changed(now, points, _less(anchors, row), anchors.positions[[row]])
+            for row in range(len(anchors))
+        )
+        gone = int(np.argmin([_cost_of(judged, quick) for judged in without_one]))
         fewer = _less(anchors, gone)
         away = np.linalg.norm(fewer.positions - anchors.positions[gone], axis=1)
         for row in np.argsort(away)[:MOVED]:

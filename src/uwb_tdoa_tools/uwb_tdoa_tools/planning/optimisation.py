@@ -445,9 +445,10 @@ def best_addition(
         more = with_one(hall.anchors, place)
         return _gains(before, hall.changed(before, points, more, place[None]), place)
 
-    promised = []
-    for place in progress.over(places, what="places for one more anchor"):
-        promised.append(_value(gains(before, points[rows], place)))
+    promised = [
+        _value(gains(before, points[rows], place))
+        for place in progress.over(places, what="places for one more anchor")
+    ]
     best: dict[str, Any] | None = None
     for number in np.argsort(-np.array(promised), kind="stable")[:VERIFIED]:
         if best is not None and promised[number] <= _value(best):
