@@ -122,10 +122,9 @@ class Evaluator:
             run = self.estimator(flight)
             odometry, residuals = run.odometry, radio_residuals(flight, run)
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
-        assert flight.truth is not None  # require_truth
         alignment = estimate_alignment(flight, odometry)
         truth_findings = list(self._truth_findings(flight, alignment))
-        truths = {align: alignment.applied_to(flight.truth, align) for align in ALIGN}
+        truths = {align: alignment.applied_to(flight.known_truth, align) for align in ALIGN}
         scores = {
             align: Score(flight.name, odometry, truth, residuals, flight.tdoa.t)
             for align, truth in truths.items()

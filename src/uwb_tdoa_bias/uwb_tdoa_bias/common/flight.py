@@ -139,6 +139,12 @@ class Flight(_SensorStreams):
         return self.end - self.start
 
     @property
+    def known_truth(self) -> Truth:
+        """Ground truth of a flight that has one."""
+        assert self.truth is not None
+        return self.truth
+
+    @property
     def streams(self) -> dict[str, Any]:
         """The streams that it has, by their names in STREAMS."""
         return {name: part for name in STREAMS if (part := getattr(self, name)) is not None}

@@ -7,16 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+from uwb_tdoa_bias.common.compiled import Record
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..core.imu_fault_detector import MOTION, RATE, TILT, TURN, WEIGHT
-
-if TYPE_CHECKING:
-    from uwb_tdoa_bias.common.compiled import Record
-
-    from ..reorder_buffer import Restart
+from ..reorder_buffer import Restart
 
 # ERROR: the estimate is wrong. WARNING: it may be worse than possible. NOTE: information.
 ERROR, WARNING, NOTE = "error", "warning", "note"
@@ -177,15 +174,11 @@ class Steady:
         out = []
         for finding in findings:
             said = self._said.get((finding.rule, finding.severity), finding)
-            out.append(said if _much_alike(said.value, finding.value) else finding)
+            alike = math.isclose(said.value, finding.value, rel_tol=SAME)
+            unknown = math.isnan(said.value) and math.isnan(finding.value)
+            out.append(said if alike or unknown else finding)
         self._said = {(finding.rule, finding.severity): finding for finding in out}
         return out
-
-
-def _much_alike(one: float, other: float) -> bool:
-    return abs(one - other) <= SAME * max(abs(one), abs(other)) or (
-        math.isnan(one) and math.isnan(other)
-    )
 
 
 TOPICS = {"imu": "imu/data", "tdoa": "uwb/tdoa"} | {

@@ -5,25 +5,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 import time
-from typing import TYPE_CHECKING
 
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
+from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.ros.node import Rate, Report
 
+from ..core.config import FilterConfig
+from ..estimator import Estimator
 from .finding import ERROR as SEVERE, Finding
 from .status import LARGEST_UNUSED, Use, flyability
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from uwb_tdoa_bias.common.flyable import FlyableVolume
-
-    from ..core.config import FilterConfig
-    from ..estimator import Estimator
 
 START_TIMEOUT = 5.0  # s of data without an initialization before a warning
 # s, age of the newest odometry: below the first it is normal, above the second the clocks are

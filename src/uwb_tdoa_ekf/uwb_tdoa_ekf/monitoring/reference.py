@@ -12,14 +12,17 @@ ODDS times more probable. Then the search continues with the next change (`..evi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.geometry import ranges
+from uwb_tdoa_bias.effects.effect_set import Covariance
 
+from ..anchor_table import AnchorTable
 from ..evidence import (
     DELAY,
     FUNCTION_LENGTH,
@@ -33,14 +36,6 @@ from ..evidence import (
     smallest_delays,
 )
 from .slices import TDOA_VARIANCE, Slice
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.effects.effect_set import Covariance
-
-    from ..anchor_table import AnchorTable
 
 CELL = 0.7  # m, size of a cell of the room
 # cells in a comparison, the latest ones; and anchors that are heard in them

@@ -5,26 +5,20 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import LOCATING
 
 from ..core.yaw_check import YAW_KNOWN
+from ..estimator import Estimator
 from ..results import Odometry
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from uwb_tdoa_bias.common.anchors import Anchors
-    from uwb_tdoa_bias.common.flyable import FlyableVolume
-
-    from ..estimator import Estimator
-    from .finding import Finding
-
+from .finding import Finding
 
 SILENT = 1.0  # s without a used measurement before it is reported
 WINDOW = 1.5  # s over which shares of TDOAs are computed

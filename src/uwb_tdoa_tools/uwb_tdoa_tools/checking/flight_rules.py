@@ -46,8 +46,7 @@ def _of_tdoas(path: KnownPath) -> list[Finding]:
 
 def judge_truth(flight: Flight) -> Iterator[Finding]:
     """Yield holes and jumps of the ground truth in the air."""
-    assert flight.truth is not None
-    of = flight.truth
+    of = flight.known_truth
     up = np.flatnonzero(of.p[:, 2] > least_height(of))
     if len(up) < 2:
         return

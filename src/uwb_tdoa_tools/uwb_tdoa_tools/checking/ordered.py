@@ -8,17 +8,18 @@ errors move the anchors by some decimetres. Only a larger gain speaks against a 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
+from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
@@ -38,12 +39,7 @@ from uwb_tdoa_ekf.monitoring.finding import Finding
 from uwb_tdoa_ekf.monitoring.windows import BEYOND
 from uwb_tdoa_ekf.results import rows_of
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from uwb_tdoa_bias.common.sensors import Ranges
-
-    from .recording import Recording
+from .recording import Recording
 
 Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
 

@@ -61,15 +61,14 @@ class KnownPath:
 
     def __init__(self, flight: Flight) -> None:
         """Compare the TDOAs of a Flight with its ground truth."""
-        assert flight.truth is not None
         self._flight = flight
         self.samples, rows = true_samples(flight)
         self.t, self.d = self.samples.t, flight.tdoa.d[rows]
         self.true = tdoa(self.samples.p, self.samples.position_a, self.samples.position_b)
         self.ids = self.samples.anchors.ids
-        self.track = Track(flight.truth)
+        self.track = Track(flight.known_truth)
         self.start = flight.start
-        self.flown = np.flatnonzero(self.samples.p[:, 2] > least_height(flight.truth))
+        self.flown = np.flatnonzero(self.samples.p[:, 2] > least_height(flight.known_truth))
         key = (self.samples.a * len(self.ids) + self.samples.b)[self.flown]
         order = np.argsort(key, kind="stable")
         parts = (

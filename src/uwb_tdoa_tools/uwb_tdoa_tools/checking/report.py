@@ -4,34 +4,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 import math
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects.base import listed
+from uwb_tdoa_ekf.monitoring.finding import Finding
 
 from .. import cli, command_lines
 from ..cli import as_json
+from ..estimate import FlightEstimator
 from ..parallel import Progress
+from ..readers.inputs import Reading
 from .check import Report, check, different_surveys
 from .ordered import OrderedRecording, displacement
 from .recording import Recording, of_flight, read_recording
 from .tdoa_rules import SAME, gained, largest_displacement
 from .watch import BEFORE_TRUTH, EXCHANGED, FIRST
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
-
-    from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.monitoring.finding import Finding
-
-    from ..estimate import FlightEstimator
-    from ..readers.inputs import Reading
-
 
 # the rule of `check` for a survey that does not fit without another mistake
 MISFIT = "survey_misfit"

@@ -130,9 +130,8 @@ def _measured(args: Namespace) -> int:
     started = time.monotonic()
     flight = options.reading_of(args).one(args.flight)
     require_truth(flight)
-    assert flight.truth is not None
     correction = demo.corrector_of(flight, args.effects, args.model)
-    length = flight.truth.t[-1] - flight.truth.t[0]
+    length = flight.known_truth.t[-1] - flight.known_truth.t[0]
     cli.show(
         f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
         f"{len(flight.anchors)} anchors"

@@ -282,8 +282,7 @@ class FirmwareFilter:
         robust : kalman.robustTdoa; corrected : uwbBias.enable; stddev : m, tdoa2.stddev
         """
         require_truth(flight)
-        truth, events = flight.truth, events_of(flight)
-        assert truth is not None
+        truth, events = flight.known_truth, events_of(flight)
         yaw = Rotation.from_quat(truth.q[0]).as_euler("ZYX")[0]
         events = events[events["t"] >= truth.t[0]]
         done = subprocess.run(
@@ -298,10 +297,9 @@ class FirmwareFilter:
     def error(self, flight: Flight, *way: Any) -> float:
         """Return the 3D RMSE of `estimate` in the air, m; NaN if the estimate is not finite."""
         t, p = self.estimate(flight, *way)
-        assert flight.truth is not None
-        _, first, last = scored_phase(flight.truth)
+        _, first, last = scored_phase(flight.known_truth)
         in_air = (t >= first) & (t <= last)
-        return rms(np.linalg.norm(p - position_at(t, flight.truth), axis=1)[in_air])
+        return rms(np.linalg.norm(p - position_at(t, flight.known_truth), axis=1)[in_air])
 
 
 def comparison(

@@ -169,8 +169,7 @@ def draw(
 
 
 def _path(ax: Axes, flight: Flight, scores: Sequence[Score]) -> None:
-    truth = flight.truth
-    assert truth is not None
+    truth = flight.known_truth
     first, last = scores[0].first, scores[0].last
     flown = (truth.t >= first) & (truth.t <= last)
     ax.plot(*truth.p[flown, :2].T, "k", lw=2.5, label="true")
@@ -329,7 +328,6 @@ def fly(
     InputError, LiveError
         If the flight cannot be played.
     """
-    assert flight.truth is not None
     bag = folder / "flight_bag"
     write_bag(flight, bag, force=True)
     live = through_nodes(flight, bag, folder, rate, files, say)
@@ -345,7 +343,7 @@ def fly(
             "corrected": live.odometry,
             "corrected, without ROS": offline.odometry,
         }
-    scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
+    scores = [Score(name, one, flight.known_truth) for name, one in estimates.items()]
     if rerun is not None:
         write_rerun(
             rerun,
@@ -353,7 +351,7 @@ def fly(
             live.odometry,
             offline.residuals,
             [change_of_scores(scores)],  # of the first two
-            flight.truth,
+            flight.known_truth,
             None if correction is None else raw.odometry,
         )
     return live, scores
@@ -474,7 +472,6 @@ def fly_both(
         If the flight cannot be played.
     """
     (flight,) = read([bag])
-    assert flight.truth is not None
     models = {"without": None, "with": model} if model else {"without": None}
     passes, scores, residuals = [], [], []
     for name, file in models.items():
@@ -491,7 +488,7 @@ def fly_both(
         passes.append(live)
         if live.missing:
             break
-        scores.append(Score(title, live.odometry, flight.truth))
+        scores.append(Score(title, live.odometry, flight.known_truth))
         residuals.append(residuals_of(flight, corrector_of(flight, None, file)))
     return LoopResult(flight, passes, scores, residuals)
 

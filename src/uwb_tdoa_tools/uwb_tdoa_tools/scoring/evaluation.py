@@ -213,8 +213,7 @@ def require_truth(flight: Flight, one_clock: bool = True) -> None:
 
 def on_another_clock(flight: Flight) -> bool:
     """Return whether ground truth (at least two poses) and TDOAs have hardly a time in common."""
-    assert flight.truth is not None
-    truth, tdoa = flight.truth.t, flight.tdoa.t
+    truth, tdoa = flight.known_truth.t, flight.tdoa.t
     if not len(tdoa):
         return False
     common = min(truth[-1], tdoa[-1]) - max(truth[0], tdoa[0])
@@ -231,9 +230,8 @@ def estimate_alignment(flight: Flight, odometry: PoseColumns) -> Alignment:
 
     Raises InputError if the truth is on another clock and the paths do not determine the offset.
     """
-    assert flight.truth is not None
     epoch = _epoch(flight, odometry) if on_another_clock(flight) else 0.0
-    truth = _advanced(flight.truth, epoch)
+    truth = _advanced(flight.known_truth, epoch)
     axes = _other_axes(truth, odometry)
     truth = transform_truth(truth, axes, np.zeros(3))
     flight = replace(flight, truth=truth)
@@ -260,11 +258,10 @@ def _rotation_to_delay_ratio(
 
     Below 1, the rotation explains everything. Infinite if there is no delay or too little data.
     """
-    assert flight.truth is not None
     if not (behind or late):
         return np.inf
     pairs = [
-        common_paths(_advanced(flight.truth, by), odometry)
+        common_paths(_advanced(flight.known_truth, by), odometry)
         for by in ((late, late + behind) if behind else (0.0, late))
     ]
     if min(len(true) for true, _ in pairs) < FEWEST:
@@ -305,7 +302,6 @@ def _truth_delay(flight: Flight, exact: bool) -> tuple[float, str | None]:
     The inertial sensor decides if it shows a delay, otherwise the TDOAs. (0, None) if neither does.
     With `exact`, the smallest delay counts.
     """
-    assert flight.truth is not None
     found, source = _inertial(flight), "inertial"
     if found is None:
         found, source = delays_of_tdoas(KnownPath(flight)), "tdoa"
@@ -315,15 +311,14 @@ def _truth_delay(flight: Flight, exact: bool) -> tuple[float, str | None]:
         return 0.0, source
     late = -found.exact()
     # a parabola between the tried delays is inexact: repeat from its minimum
-    moved = replace(flight, truth=_advanced(flight.truth, late))
+    moved = replace(flight, truth=_advanced(flight.known_truth, late))
     again = _inertial(moved) if source == "inertial" else delays_of_tdoas(KnownPath(moved))
     return late - (again.exact() if again else 0.0), source
 
 
 def _tdoa_delay(flight: Flight, late: float) -> float:
     """Return the delay of the ground truth against the TDOAs, s, after its own delay `late`."""
-    assert flight.truth is not None
-    found = delays_of_tdoas(KnownPath(replace(flight, truth=_advanced(flight.truth, late))))
+    found = delays_of_tdoas(KnownPath(replace(flight, truth=_advanced(flight.known_truth, late))))
     return -found.exact() if found and _is_significant(*found.constant()) else 0.0
 
 
@@ -333,14 +328,13 @@ def _is_significant(ratio: float, delay: float) -> bool:
 
 def _inertial(flight: Flight) -> Delays | None:
     """Return the delays of the inertial samples against the ground truth; None without contrast."""
-    assert flight.truth is not None
     if (
         flight.imu is None
         or len(flight.imu) < 2
-        or np.isfinite(flight.truth.q).all(axis=1).sum() < 2
+        or np.isfinite(flight.known_truth.q).all(axis=1).sum() < 2
     ):
         return None
-    motion = TrueMotion(flight.imu, flight.truth)
+    motion = TrueMotion(flight.imu, flight.known_truth)
     if len(motion) < FEWEST:
         return None
     found = motion.delays()
@@ -386,8 +380,7 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
 
     It minimizes the distance between the paths: as they are, or about their middle with other axes.
     """
-    assert flight.truth is not None
-    truth = flight.truth
+    truth = flight.known_truth
     if len(odometry.t) < 2:
         raise InputError(
             f"{flight.name}: the ground truth is on another clock than the TDOAs, and there "
@@ -494,9 +487,8 @@ def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
 
 def corrected_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
     """Return the ground truth of a Flight without its errors that the EffectSet describes."""
-    truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
-    assert truth is not None
-    return truth
+    straight = effects.correct_streams(replace(flight, imu=None)) if effects else flight
+    return straight.known_truth
 
 
 def align_truth(
@@ -524,7 +516,6 @@ def align_truth(
     Raises InputError.
     """
     require_truth(flight, align == NONE)
-    assert flight.truth is not None
     effects = effects or EffectSet()
     found = _alignment(flight, effects, config)
     sentences = [
@@ -534,7 +525,9 @@ def align_truth(
     ]
     return replace(
         flight,
-        truth=found.significant().applied_to(flight.truth, FRAME if found.frame_differs else TIME),
+        truth=found.significant().applied_to(
+            flight.known_truth, FRAME if found.frame_differs else TIME
+        ),
     ), tuple(sentences)
 
 
@@ -573,22 +566,21 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     """
     straight = effects.correct_streams(flight)
     odometry = FlightEstimator(config, effects)(flight).odometry
-    assert straight.truth is not None
     found = estimate_alignment(straight, odometry)
     if found.frame_differs and (
         _ranges_fit(straight, effects, found) or delays_fit(straight, effects, found)
     ):
         found = replace(found, axes=np.eye(3), turn=np.eye(3), shift=np.zeros(3))
     repair = (
-        EffectSet(repairs(replace(straight, truth=found.applied_to(straight.truth, TIME))))
+        EffectSet(repairs(replace(straight, truth=found.applied_to(straight.known_truth, TIME))))
         if found.frame_differs
         else EffectSet()
     )
     if not len(repair):
         return found
     of_labels = FlightEstimator(config, effects)(repair.correct_streams(flight)).odometry
-    error = median_distance(*common_paths(found.applied_to(straight.truth, TIME), of_labels))
-    left = median_distance(*common_paths(found.applied_to(straight.truth, FRAME), odometry))
+    error = median_distance(*common_paths(found.applied_to(straight.known_truth, TIME), of_labels))
+    left = median_distance(*common_paths(found.applied_to(straight.known_truth, FRAME), odometry))
     return (
         estimate_alignment(repair.correct_streams(straight), of_labels)
         if error < LARGEST_LABEL_RATIO * left
@@ -625,9 +617,8 @@ def _residuals(
 
     Then with the frame moved.
     """
-    assert flight.truth is not None
     for how in (TIME, FRAME):
-        moved = replace(flight, truth=found.significant().applied_to(flight.truth, how))
+        moved = replace(flight, truth=found.significant().applied_to(flight.known_truth, how))
         samples, rows = true_samples(moved, RADIO[stream])
         measured = getattr(flight, stream).d[rows]
         yield samples, measured - samples.predicted() - effects.bias(samples)

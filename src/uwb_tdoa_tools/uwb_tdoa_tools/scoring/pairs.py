@@ -106,12 +106,11 @@ def _signed_cm(values: np.ndarray) -> str:
 
 def residuals_of(flight: Flight, corrector: Corrector | None = None) -> PairResiduals:
     """Return the PairResiduals of a Flight with ground truth in the air, corrected if asked."""
-    assert flight.truth is not None
     samples, rows = true_samples(flight)
     off = flight.tdoa.d[rows] - tdoa(samples.p, samples.position_a, samples.position_b)
     if corrector is not None:
         off = off - corrector.prediction(samples).bias
-    _, first, last = scored_phase(flight.truth)
+    _, first, last = scored_phase(flight.known_truth)
     number, count = (samples.t - first) // PERIOD, int((last - first) / PERIOD)
     rows = np.flatnonzero((number >= 0) & (number < count))
     cells = np.column_stack([samples.a, samples.b, number])[rows].astype(int)

@@ -60,12 +60,11 @@ def check_image(path: Path | None) -> None:
 
 def plot(flight: Flight, path: str | Path) -> None:
     """Draw path and anchors from above, height, bias and error of the TDOAs, to an image file."""
-    assert flight.truth is not None
     from matplotlib.figure import Figure  # takes a second to import
 
     from ..scoring.plots import labels
 
-    parts, truth, tdoa = flight.extra["tdoa_truth"], flight.truth, flight.tdoa
+    parts, truth, tdoa = flight.extra["tdoa_truth"], flight.known_truth, flight.tdoa
     figure = Figure(figsize=(12, 7), layout="constrained")
     figure.suptitle(flight.name)
     (above, height), (bias, error) = figure.subplots(2, 2)
