@@ -40,7 +40,7 @@ from .correction.model import EFFECTS, FADED, NETWORK, PASSED, load_network
 from .effects import EffectSet, LabelEffect
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm
-from .ros.anchors import ANCHORS_FILE, AnchorsInput, FramesInput, unknown_frame
+from .ros.anchors import ANCHORS_FILE, MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
 from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.node import Diagnostics, Rate, Report, StreamNode, StreamPoller, run
 from .ros.parameters import (
@@ -102,7 +102,6 @@ CORRECTED = (  # fields written of a TdoaCorrected
     "bias_slope",
     "bias_state",
 )
-MOST_FRAMES = 100  # limit, since a topic may carry any number of names
 EARLY = 2000  # TDOAs kept until anchors arrive
 Item = tuple[Any, ...]  # one TDOA: frame, sec, nanosec, and MEASURED
 FRAME, ANCHOR_A, ANCHOR_B, DIFFERENCE = 0, 3, 4, 5  # places in an Item

@@ -36,7 +36,7 @@ from uwb_tdoa_bias.common.transforms import Place
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.ros.anchors import AnchorsInput, FramesInput, unknown_frame
+from uwb_tdoa_bias.ros.anchors import MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
 from uwb_tdoa_bias.ros.node import Diagnostics, Elapsed, Report, StreamNode, StreamPoller, run
 from uwb_tdoa_bias.ros.parameters import refuse_unknown
@@ -87,7 +87,6 @@ TOPICS = {
     name: [(topic, message_class(kind), *sensor.fields) for topic, kind in sensor.topics]
     for name, sensor in SENSORS.items()
 }
-MOST_FRAMES = 100  # frames of the IMU to remember; a topic may carry any number of names
 MOST_NAMED = 3  # frames that one message names
 MAST = 0.1  # m, height of an antenna over the body from which the two heights differ visibly
 EARLY = 5000  # messages kept until anchors arrive

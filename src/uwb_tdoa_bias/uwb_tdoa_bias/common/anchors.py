@@ -157,9 +157,11 @@ class Anchors:
 
     def to_yaml(self, path: str | Path) -> None:
         """Write a YAML file that `read_survey` reads."""
-        entries = {}
-        for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
-            entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
+        columns = self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()
+        entries = {
+            i: {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
+            for i, p, q in zip(*columns)
+        }
         text = yaml.safe_dump(
             {"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None
         )

@@ -36,7 +36,7 @@ from ..common.compiled import compiled
 from ..common.errors import MODEL_BYTES, InputError, printable, sanitize
 from ..common.files import read_bytes
 from ..common.geometry import rotate
-from ..effects.base import cached_by_anchors, counted
+from ..effects.base import FADED_BELOW, cached_by_anchors, counted
 from ..effects.samples import N_STATES, Samples
 
 if TYPE_CHECKING:
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
-# Share of the possible knowledge; a prediction with less counts as faded.
-FADED_BELOW = 0.5
 # m. A file that adds more is broken: the largest measured bias is 4 m.
 LARGEST_ADDED = 100.0
 

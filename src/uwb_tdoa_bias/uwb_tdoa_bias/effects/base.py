@@ -31,7 +31,9 @@ from .samples import (
 __all__ = ["ArrivalEffect", "Effect", "Row", "Samples"]
 
 SIGNIFICANT = 2.0  # standard deviations; the data do not determine a smaller value
-FADED_BELOW = 0.5  # weight of an effect below which nodes report it as faded
+FADED_BELOW = (
+    0.5  # weight of an effect, or share of the knowledge of a network, below which it is faded
+)
 ROUNDED = 0.1  # share by which a printed standard deviation may be rounded
 LARGEST = 3  # values in one sentence
 TABLE_STEPS = 256  # intervals in the table of a SensorFunction

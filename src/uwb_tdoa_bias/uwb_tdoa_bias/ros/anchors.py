@@ -19,7 +19,7 @@ from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from ..common.anchors import SAME_PLACE, Anchors, refuse_faulty
+from ..common.anchors import MOST_NAMED, SAME_PLACE, Anchors, refuse_faulty
 from ..common.errors import InputError
 from ..common.survey import read_survey
 from ..common.transforms import Frames
@@ -30,7 +30,7 @@ from .topics import Input, Refusals, publishers_of
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-MOST_NAMED = 10  # anchors named in a sentence
+MOST_FRAMES = 100  # names that a node remembers; a topic may carry any number of them
 SAME_TURN = 1e-3  # largest difference of quaternions of the same anchor
 # Best effort and volatile: such a subscription receives messages from every publisher.
 ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -36,7 +36,7 @@ from ..localizing.pictures import write_rerun
 from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..scoring.metrics import Estimate, Score, change_in_words, position_at
-from ..scoring.pairs import PairResiduals, residuals_of
+from ..scoring.pairs import CM, PairResiduals, residuals_of
 from ..simulation import SimulationConfig, simulate
 from ..simulation.inject import hidden_effect
 
@@ -51,7 +51,6 @@ HALL = SimulationConfig(
     duration=40.0, speed=1.2, imu_rate=200.0, truth_rate=100.0, bias=False, multipath=False
 )
 YAWS = ("along_track", "rotating", "along_track")  # of the flights
-CM = 100.0  # cm per metre
 COLOURS = ("tab:red", "tab:blue")  # of a flight without and with the correction
 SIZE = 14  # points: legible if the picture is shrunk to 700 pixels
 ROOM = 1.3  # of the largest error, the end of the axis: the legend covers no line

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.geometry import rotate
 from uwb_tdoa_bias.common.sensors import SENSORS, Stream
@@ -39,9 +39,6 @@ from ..choices import MOMENTS
 from ..simulation.config import ImuErrors, corners
 from ..simulation.inject import parse_effect
 from ..simulation.sensors import make_schedule, outliers, tdoa_noise
-
-# Compiled code reads the fields of a structured row as attributes. Python has no type for that.
-Record = Any
 
 GRAVITY = 9.81  # m/s^2
 STEP = 0.625e-3  # s, of the integration (midpoint)

@@ -38,7 +38,7 @@ from ..bags.files import open_bag
 from .session import Stop, recorded_odometry, session, taken
 
 STOP_LIMIT, PATIENCE = 10.0, 60.0  # s from SIGINT to SIGKILL; the latter if it must end well
-LOOK = 10.0  # s between two checks of the processes, and between two lines about them
+LOOK = 10.0  # s between two looks at what is waited for, and between two lines about it
 READY = re.compile(r"\]: ready\b")  # in the log of a node
 TAIL = 8192  # bytes of a log that are looked at
 BUSY = 0.2  # share of the time beyond which a process computes; nodes that wait take 0.02
@@ -343,7 +343,9 @@ RELIABLE = {
 DEPTH = 1_000_000  # messages that may wait in a subscription
 READY_LIMIT = 60.0  # s without progress; the first start compiles the filter, which is progress
 MATCH_LIMIT = 300.0  # s; a slow machine takes long to find the nodes
-SETTLE_LIMIT = 60.0  # s without a change of the counters, while the nodes work off a fast replay
+SETTLE_LIMIT = (
+    60.0  # s for the diagnostics of the nodes to settle, without a change of the counters
+)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..bags.files import BagReader, open_bag
 from ..choices import WAIT
-from .processes import DiagnosticsListener
+from .processes import LOOK, SETTLE_LIMIT, DiagnosticsListener
 from .session import (
     ANSWER_LIMIT,
     READER_DEPTH,
@@ -64,7 +64,6 @@ SENSOR_SHARE = (
 LAG = 0.25  # s, default of `lag`
 IDLE = 2  # reports of a node with unchanged counters after which it has nothing to do
 SILENCE = 5.0  # s without a message after which a topic of other nodes is silent
-LOOK = 10.0  # s between two looks at the nodes that are waited for
 # s without output or a change of a counter after which the nodes are stuck, on any machine
 STUCK = 120.0
 POLL_PERIOD = 0.001  # s
@@ -268,7 +267,6 @@ def stamp_of(data: bytes) -> int:
     return seconds * 10**9 + nanoseconds
 
 
-SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle
 PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
 TROUBLE = {  # {node: {key in its diagnostics: words}}
     "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
