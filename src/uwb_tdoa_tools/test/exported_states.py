@@ -114,7 +114,7 @@ def product(anchors, form, factor, shape):
 def term(anchors, covariate, form, shape="spline"):
     """Return a SmoothTerm of random coefficients."""
     low, high = RANGES.get(covariate, ANGLE)
-    count = SHAPES[shape][0] if shape in SHAPES else 5
+    count = SHAPES.get(shape, (None,))[0] or 5  # of a spline, or switching: any number
     names = covariate in CATEGORIES
     knots = anchors.ids.tolist() if names else np.linspace(low, high, count).tolist()
     parts = {"anchor": [str(i) for i in anchors.ids], "pair": ["0-1", "2-5"]}

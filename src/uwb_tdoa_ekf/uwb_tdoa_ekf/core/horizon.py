@@ -262,7 +262,7 @@ def _predict(
     White acceleration drives the velocity (an Ornstein-Uhlenbeck process). motion is as for `_forward`.
     The transition is stored in a STEP.
     """
-    psd, fading = motion
+    psd, fading = motion[0], motion[1]
     kept = math.exp(-dt / fading)
     way = fading * (1.0 - kept)
     one.kept, one.way = kept, way
