@@ -66,12 +66,13 @@ BODIES = {
     "train": Body((28.0, 0.8, 0.0), 3.0),
 }
 # errors of anchors; and anchors on one line that is no axis, anchors of the ceiling alone, rates beyond
-# the range of the gyroscope, a height that is not fixed
+# the range of the gyroscope, a height that is fixed, for a lift wrongly
 ERRORS = "white", "delays", "survey", "reflections"
 LINE, CEILING, CLIPPED, FIXED = "oblique line", "ceiling", "clipped gyroscope", "fixed height"
 # anchors of a hall of 40 x 30 m and of a tunnel of 60 x 4 m, of which the tag hears the nearest eight;
-# wheels that measure velocity and yaw rate
-HALL, TUNNEL, WHEELS = "hall", "tunnel", "wheels"
+# wheels that measure velocity and yaw rate; an IMU with a tenth of the noise
+HALL, TUNNEL, WHEELS, QUIET = "hall", "tunnel", "wheels", "quiet IMU"
+HEIGHT, HEIGHT_STD = 1.2, 0.05  # m, fixed height
 SHARE = 0.023  # of the samples of a gyroscope, beyond its range
 CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("rest", 0, 1, "white"),
@@ -83,6 +84,9 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("rest", 100, 10, "survey"),
     ("rest", 100, 50, "delays"),
     ("rest", 500, 400, "delays"),
+    ("rest", 100, 2, QUIET),
+    ("rest", 100, 10, QUIET),
+    ("rest", 500, 400, QUIET),
     ("person", 0, 1, "white"),
     ("person", 0, 2, "white"),
     ("person", 0, 5, "reflections"),
@@ -117,6 +121,12 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("quadrotor", 500, 50, LINE),
     ("racing", 500, 200, CLIPPED),
     ("lift", 100, 50, FIXED),
+    ("lift", 0, 10, FIXED),
+    ("rest", 0, 2, FIXED),
+    ("person", 0, 5, FIXED),
+    ("runner", 0, 5, FIXED),
+    ("rover", 0, 10, FIXED),
+    ("forklift", 0, 2, f"{FIXED} in a {HALL}"),
     ("forklift", 0, 2, HALL),
     ("forklift", 0, 10, HALL),
     ("forklift", 100, 20, HALL),
@@ -165,10 +175,10 @@ def simulate(
         places[:4] = [(4.0, 0.0, 2.6), (0.0, 4.0, 2.6), (-4.0, 0.0, 2.6), (0.0, -4.0, 2.6)]
     if errors == LINE:
         places = np.linspace((-4.0, -2.4, 2.8), (4.0, 2.4, 2.8), 8)
-    if errors in (HALL, TUNNEL):
+    if errors.endswith((HALL, TUNNEL)):
         x, y = (
             ([-20, -10, 0, 10, 20], [-15, -5, 5, 15])
-            if errors == HALL
+            if errors.endswith(HALL)
             else (range(-30, 31, 6), [-2, 2])
         )
         places = np.array(
@@ -181,7 +191,7 @@ def simulate(
         name,
         anchors,
         _tdoas(path, places, rate, errors, rng),
-        _imu(t, a, q, imu_rate, errors == CLIPPED, rng) if imu_rate else None,
+        _imu(t, a, q, imu_rate, errors, rng) if imu_rate else None,
         Truth(t[::10], p[::10], q.as_quat()[::10]),
     )
     if errors == WHEELS:
@@ -220,13 +230,14 @@ def _wheels(t: np.ndarray, v: np.ndarray, q: Rotation, rng: Any) -> Velocity:
     return Velocity(t, of_body * [1.0, 0.0, 0.0], std, rate, np.full(n, 0.02))
 
 
-def _imu(t: np.ndarray, a: np.ndarray, q: Rotation, rate: float, clipped: bool, rng: Any) -> Imu:
+def _imu(t: np.ndarray, a: np.ndarray, q: Rotation, rate: float, errors: str, rng: Any) -> Imu:
     """Return inertial samples with biases and white noise."""
     rows = np.arange(0, len(t) - 1, round(1000 / rate))
     gyro = (q[rows].inv() * q[rows + 1]).as_rotvec() / 1e-3 + 0.005 * rng.normal(size=3)
     accel = q[rows].inv().apply(a[rows] + GRAVITY) + 0.05 * rng.normal(size=3)
     scatter = math.sqrt(rate) * rng.normal(size=(2, len(rows), 3))
-    limit = np.quantile(np.abs(gyro).max(axis=1), 1.0 - SHARE) if clipped else np.inf
+    scatter *= 0.1 if errors == QUIET else 1.0
+    limit = np.quantile(np.abs(gyro).max(axis=1), 1.0 - SHARE) if errors == CLIPPED else np.inf
     return Imu(
         t[rows], np.clip(gyro + 0.002 * scatter[0], -limit, limit), accel + 0.02 * scatter[1]
     )
@@ -241,11 +252,13 @@ def _geometry(flight: Flight, rows: np.ndarray, p: np.ndarray) -> tuple[np.ndarr
     return tdoa.d[rows] - (away_b - away_a), H
 
 
-def kalman(flight: Flight, density: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def kalman(
+    flight: Flight, density: float, fixed: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stamps, positions and covariances of an extended iterated Kalman filter: constant velocity.
 
     Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, sections 6.2.2
-    and 10.5.2.
+    and 10.5.2. fixed : the height is known to be HEIGHT.
     """
     truth, t = flight.truth, flight.tdoa.t
     assert truth is not None
@@ -260,6 +273,9 @@ def kalman(flight: Flight, density: float) -> tuple[np.ndarray, np.ndarray, np.n
                 [dt**3 / 3.0, dt**2 / 2.0, dt**2 / 2.0, dt]
             )
         x, P = F @ x, F @ P @ F.T + Q
+        if fixed:
+            gain = P[:, 2] / (P[2, 2] + HEIGHT_STD**2)
+            x, P = x + gain * (HEIGHT - x[2]), P - np.outer(gain, P[2])
         prior = x
         for _ in range(5):  # iterated: linearized anew at the updated position
             r, H = _geometry(flight, np.array([k]), x[None, :3])
@@ -272,7 +288,7 @@ def kalman(flight: Flight, density: float) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def least_squares(
-    flight: Flight, density: float, begin: np.ndarray
+    flight: Flight, density: float, begin: np.ndarray, fixed: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return stamps and positions of batch least squares: positions at knots, random acceleration.
 
@@ -292,11 +308,14 @@ def least_squares(
     second = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n))  # type: ignore[list-item]
     smooth_by = second.T @ second / (max(density, 1e-4) * KNOT**3)
     prior = sparse.block_diag([smooth_by] * 3) + 1e-6 * sparse.eye(3 * n)
+    level = np.tile([0.0, 0.0, HEIGHT], (n, 1)) * fixed
+    prior += sparse.diags([np.repeat([0.0, 0.0, fixed / HEIGHT_STD**2], n)], [0])
     for _ in range(8):
         r, H = _geometry(flight, rows, at @ p)
         J = sparse.hstack([sparse.diags(H[:, k]) @ at for k in range(3)]).tocsr()
         system = J.T @ J / NOISE**2 + prior
-        p += splu(system.tocsc()).solve(J.T @ r / NOISE**2 - prior @ p.T.ravel()).reshape(3, n).T
+        right = J.T @ r / NOISE**2 - prior @ (p - level).T.ravel()
+        p += splu(system.tocsc()).solve(right).reshape(3, n).T
     return t, p
 
 
@@ -381,15 +400,18 @@ def measure(item: tuple[str, int]) -> dict[str, dict[str, float]]:
     body, imu, rate, errors = name.split(", ")
     flight, density = simulate(body, float(imu.split()[1]), float(rate.split()[0]), errors, seed)
     config = FilterConfig(
-        use_imu=flight.imu is not None, fixed_height=1.2, fixed_height_std=0.05 * (errors == FIXED)
+        use_imu=flight.imu is not None,
+        fixed_height=HEIGHT,
+        fixed_height_std=HEIGHT_STD * errors.startswith(FIXED),
     )
+    fixed = errors.startswith(FIXED) and body != "lift"
     online, smoothed = run_offline(flight, config).odometry, smooth(flight, config).odometry
-    t, p, covariance = kalman(flight, density)
+    t, p, covariance = kalman(flight, density, fixed)
     out = {
         "filter": _judge(flight, online.t, online.p, online.covariance),
         "smoother": _judge(flight, smoothed.t, smoothed.p, smoothed.covariance),
         "kalman": _judge(flight, t, p, covariance),
-        "batch": _judge(flight, *least_squares(flight, density, p)),
+        "batch": _judge(flight, *least_squares(flight, density, p, fixed)),
     }
     if flight.imu is not None and BODIES[body].speed:
         out["filter"]["yaw"] = _nees_of_yaw(flight, online)

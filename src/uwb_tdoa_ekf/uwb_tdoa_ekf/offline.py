@@ -346,6 +346,8 @@ class Run:
         Common offset of all ranges and its standard deviation, in m, when its variance was
         smallest. Positive means that ranges are too long. The standard deviation covers noise
         alone. None if the filter did not estimate the offset.
+    left_height : bool
+        Whether TDOAs have contradicted `fixed_height`.
     """
 
     odometry: Odometry
@@ -356,6 +358,7 @@ class Run:
     yaw_offset: float
     sensors: dict[str, np.ndarray]
     range_offset: tuple[float, float] | None = None
+    left_height: bool = False
 
     @property
     def counts(self) -> dict[str, int]:
@@ -448,6 +451,7 @@ def run_offline(
         yaw_offset(int(ekf.best if ekf.first_best < 0 else ekf.first_best)),
         sensors,
         found,
+        bool(ekf.height.ignore_time > 0.0 and config.fixed_height_std > 0.0),
     )
 
 

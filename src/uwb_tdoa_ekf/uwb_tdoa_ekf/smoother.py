@@ -152,9 +152,8 @@ def _is_alone(flight: Flight, config: FilterConfig) -> bool:
     imu = flight.imu if config.use_imu else None
     headless = imu is None and config.initial_yaw_std > YAW_STD
     velocity = None if headless and rate < FEWEST_OF_YAW / YAW_SECONDS else flight.velocity
-    held = config.planar or config.fixed_height_std > 0.0 or not config.adapt_noise
     measured = any(other is not None for other in (velocity, flight.range, flight.height, imu))
-    return rate < horizon.BEGINS and not held and not measured
+    return rate < horizon.BEGINS and config.adapt_noise and not measured
 
 
 def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
@@ -168,7 +167,11 @@ def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector |
     begins = [begin, *_on_both_sides(begin, flight.anchors.positions)]
     bounds = np.empty((2, 3))
     workspace.set_bounds(state.record.extent, config.workspace_margin, bounds)
-    rows = horizon.smooth(tdoas, state.anchors, config.parameters(), bounds, np.array(begins))
+    parameters = config.parameters()
+    bounds = horizon.within(bounds, parameters[0], run.left_height)
+    rows = horizon.smooth(tdoas, state.anchors, parameters, bounds, np.array(begins))
+    if config.planar:
+        plane.flatten_all(rows, parameters)
     number = np.floor(rows["t"] * config.odometry_rate)
     rows = rows[np.append(number[1:] != number[:-1], True)]
     last = np.maximum(np.searchsorted(path.t, rows["t"], side="right") - 1, 0)

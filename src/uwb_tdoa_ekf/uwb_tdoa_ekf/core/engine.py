@@ -207,6 +207,8 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
             and inertial.is_quiet(ekf.imu)
         )
         stationarity.update_zero_velocity(ekf, sample.t, records)
+    if not (continuous and inertial.is_quiet(ekf.imu)):
+        ekf.shaken = sample.t
     inertial.store(ekf.imu, sample)
 
 
@@ -297,7 +299,7 @@ def _on_range(
     _prepare(ekf, anchors, parameters, t, records)
     anchor, innovation = anchors[sensor.anchor], ekf.innovation
     # a range shares the error of one anchor with others, a TDOA those of two
-    inflation = 0.5 * (1.0 + noise.variance_inflation(ekf, parameters, t))
+    inflation = 0.5 * (1.0 + noise.variance_inflation(ekf, parameters))
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
@@ -563,7 +565,7 @@ def _update(
         if abs(innovation.value) > INLIER:
             _reject(residual, innovation)
             return False
-    inflation = noise.variance_inflation(ekf, parameters, tdoa.t)
+    inflation = noise.variance_inflation(ekf, parameters)
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):

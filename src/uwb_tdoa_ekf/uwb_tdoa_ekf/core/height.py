@@ -41,6 +41,7 @@ ALIKE = 0.15  # m within which disagreeing ranges agree with each other
 STEP_TIME, STEP_COUNT = 0.25, 7  # s and number of consistent ranges that show a step
 HIGHEST_STEP = 1.5  # m, of the ground
 PULL_SCALE = 3.0  # m, scale of the loss that weighs the innovations of TDOAs
+FEWEST = 16.0  # least number of TDOAs that an average covers
 PULL_LIMIT = 0.45  # m by which TDOAs disagree
 EXPLAINED = 0.5  # of tdoa_std, root mean square that errors of all TDOAs may have in common
 # s of disagreement after which the range finder is ignored, for as long the first time, and at most
@@ -291,10 +292,11 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
         return
     if height.compared == -np.inf and not ranged:
         height.pulls_since = t
-    step = min(1.0, max(0.0, t - height.compared) / MEMORY)
+    step = min(1.0 / FEWEST, max(0.0, t - height.compared) / MEMORY)
     height.compared = t
     row = innovation.row[2]
     w = weight(GEMAN_MCCLURE, innovation.value, PULL_SCALE)
+    w *= innovation.noise_variance / (innovation.noise_variance + innovation.prior_variance)
     height.pull += step * (w * row * innovation.value - height.pull)
     height.pull_information += step * (w * row * row - height.pull_information)
     if abs(height.pull) < PULL_LIMIT * height.pull_information:

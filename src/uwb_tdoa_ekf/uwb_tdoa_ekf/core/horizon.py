@@ -1,6 +1,6 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Moving horizon estimate of a tag that sends few TDOAs and has no other sensor.
+"""Moving horizon estimate of a tag that sends few TDOAs and has no other sensor, or a quiet IMU.
 
 Between two TDOAs such a tag moves by metres. A TDOA is not linear over such a distance, so an update
 of a prediction is often wrong. The last ROOM TDOAs are therefore linearized again with each new TDOA,
@@ -41,6 +41,7 @@ MEMORY = 5.0  # s of TDOAs that decide between the models
 # TDOAs in the last second below which the horizon begins, and above which it ends
 BEGINS, ENDS = (30, 45)
 ALONE = 5.0  # s without another sensor after which a tag counts as alone
+QUIET = 1.0  # s after which a quiet tag does: its inertial sensor does not show where it is
 # passes over the window with a new TDOA, at the begin, and over a recording
 PASSES, FIRST, ALL = (2, 10, 15)
 BEND = 4.0  # standard deviations at which the losses bend
@@ -68,6 +69,7 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
         Stamp, s.
     """
     horizon, best, passes = ekf.horizon, ekf.hypotheses[ekf.best], PASSES
+    bounds = within(ekf.workspace, parameters, ekf.height.ignore_time > 0.0)
     most = ENDS if horizon.state == RUNNING else BEGINS
     if (
         not (parameters.adapt_noise and parameters.recover)
@@ -82,9 +84,9 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
         horizon.state = RUNNING
         return
     if horizon.state == RUNNING:
-        _add(ekf, anchors, parameters)
+        _add(ekf, anchors, parameters, bounds)
     else:
-        _begin_anew(ekf, parameters)
+        _begin_anew(ekf, parameters, bounds)
         passes = FIRST
     horizon.state = RUNNING
     n, scores = horizon.count, np.empty(MODELS)
@@ -94,7 +96,7 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
         model, motion = horizon.models[m], _motion(m, parameters)
         at = model.at[:n]
         for _ in range(passes):
-            _forward(model, window, anchors, motion, ekf.workspace, at, steps)
+            _forward(model, window, anchors, motion, bounds, at, steps)
             _backward(steps, at, no_rows)
             _weigh(model.std, window, anchors, at)
             # an outlier moves the end of the path, so the residual to the path does not show it
@@ -107,18 +109,28 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
 
 
 @compiled
-def _motion(m: int, parameters: Record) -> tuple[float, float]:
+def within(workspace: np.ndarray, parameters: Record, left_height: bool) -> np.ndarray:
+    """Return a workspace (2, 3), m; of a tag that has not left its fixed height, only this height."""
+    bounds = workspace.copy()
+    if parameters.planar or (parameters.fixed_height_std > 0.0 and not left_height):
+        bounds[:, 2] = parameters.fixed_height
+    return bounds
+
+
+@compiled
+def _motion(m: int, parameters: Record) -> tuple[float, float, float]:
     """Return the motion of model m, as `_forward` takes it."""
-    return (SHARES[m] * parameters.motion_noise) ** 2, FADING[m]
+    power = (SHARES[m] * parameters.motion_noise) ** 2
+    return power, FADING[m], parameters.fixed_height_std
 
 
 @compiled
 def _is_alone(ekf: Record, parameters: Record, t: float) -> bool:
-    """Return whether no other sensor than TDOAs is used, and none was heard in the last ALONE s."""
+    """Return whether only TDOAs show the motion: no other sensor was heard lately, or it is quiet."""
     since = max(ekf.velocity.heard, ekf.height.heard, ekf.barometer.heard, ekf.ranged[0].t)
-    if parameters.use_imu:
-        since = max(since, ekf.imu.t)
-    return t - since > ALONE and parameters.fixed_height_std == 0.0 and not parameters.planar
+    if parameters.use_imu and t - ekf.shaken < QUIET:
+        return False
+    return t - since > ALONE
 
 
 @compiled
@@ -135,12 +147,12 @@ def _begin(
 
 
 @compiled
-def _begin_anew(ekf: Record, parameters: Record) -> None:
-    """Begin with the TDOAs of a start, anywhere in the workspace, linearized at the start position."""
+def _begin_anew(ekf: Record, parameters: Record, bounds: np.ndarray) -> None:
+    """Begin with the TDOAs of a start, anywhere in bounds (2, 3), m, linearized at its position."""
     window, horizon = last_few(ekf), ekf.horizon
     n = min(len(window), ROOM)
     x, covariance = np.zeros(6), np.zeros((6, 6))
-    anywhere(ekf.workspace, x, covariance)
+    anywhere(bounds, x, covariance)
     _begin(horizon, parameters, window[len(window) - n].t, x, covariance)
     horizon.count = n
     for m in range(MODELS):
@@ -160,7 +172,7 @@ def anywhere(workspace: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> No
 
 
 @compiled
-def _add(ekf: Record, anchors: np.ndarray, parameters: Record) -> None:
+def _add(ekf: Record, anchors: np.ndarray, parameters: Record, bounds: np.ndarray) -> None:
     """Add the newest TDOA to the window; the oldest one moves into the state before the window."""
     horizon, n = ekf.horizon, ekf.horizon.count
     newest, full = ekf.window[ekf.kept - 1], n == ROOM
@@ -171,7 +183,7 @@ def _add(ekf: Record, anchors: np.ndarray, parameters: Record) -> None:
         if full:
             motion = _motion(m, parameters)
             oldest = ekf.window[ekf.kept - 1 - n : ekf.kept - n]
-            _forward(model, oldest, anchors, motion, ekf.workspace, model.at, horizon.steps)
+            _forward(model, oldest, anchors, motion, bounds, model.at, horizon.steps)
             model.t, model.x[:] = oldest[0].t, model.end
             model.P[:, :] = model.end_P
             for k in range(ROOM - 1):
@@ -186,7 +198,7 @@ def _forward(
     model: Record,
     window: np.ndarray,
     anchors: np.ndarray,
-    motion: tuple[float, float],
+    motion: tuple[float, float, float],
     bounds: np.ndarray,
     at: np.ndarray,
     steps: np.ndarray,
@@ -202,9 +214,10 @@ def _forward(
     anchors : (N,) ANCHOR
         All anchors, by row.
     motion : tuple
-        Power of the random acceleration, m^2/s^3, and time in s in which the velocity fades.
+        Power of the random acceleration, m^2/s^3, time in s in which the velocity fades, and standard
+            deviation of a known height, m.
     bounds : (2, 3) array
-        Workspace, m, world frame.
+        Workspace, m, world frame, from `within`.
     at : (n,) LINEARIZATION
         Where each TDOA is linearized, and its robust weight.
     steps : (n,) STEP
@@ -219,7 +232,7 @@ def _forward(
         _predict(x, P, tdoa.t - t, motion, one)
         t = tdoa.t
         for k in range(3):
-            _bound(x, P, bounds, k, one.bounds[k])
+            _bound(x, P, bounds, motion[2], k, one.bounds[k])
         one.x[:] = x
         one.P[:, :] = P
         row = update.jacobian
@@ -255,7 +268,7 @@ def _update(x: np.ndarray, P: np.ndarray, noise: float, update: Record) -> None:
 
 @compiled
 def _predict(
-    x: np.ndarray, P: np.ndarray, dt: float, motion: tuple[float, float], one: Record
+    x: np.ndarray, P: np.ndarray, dt: float, motion: tuple[float, float, float], one: Record
 ) -> None:
     """Predict a state x (6,) and covariance P (6, 6) over dt (s) with a velocity that fades.
 
@@ -284,9 +297,16 @@ def _predict(
 
 
 @compiled
-def _bound(x: np.ndarray, P: np.ndarray, bounds: np.ndarray, axis: int, update: Record) -> None:
-    """Apply the prior of the workspace to x (6,) and P (6, 6), as `workspace.constrain` does."""
+def _bound(
+    x: np.ndarray, P: np.ndarray, bounds: np.ndarray, of_height: float, axis: int, update: Record
+) -> None:
+    """Apply the prior of the workspace to x (6,) and P (6, 6), as `workspace.constrain` does.
+
+    of_height is the standard deviation of a known height, m.
+    """
     place, std = prior_of(bounds, x, axis)
+    if bounds[0, axis] == bounds[1, axis]:
+        std = of_height
     update.variance = 0.0
     if P[axis, axis] > std**2:
         update.jacobian[:] = 0.0

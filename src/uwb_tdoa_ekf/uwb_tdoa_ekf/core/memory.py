@@ -269,6 +269,7 @@ EKF = _record(
     # s, stamp until which the first inertial samples of a running filter are averaged; -inf:
     # samples are used
     ("attitude_averaged_until", float),
+    ("shaken", float),  # s, stamp of the last inertial sample of a tag that was not quiet
     ("quiet", bool),  # the inertial sensor neither vibrates nor turns
     ("resting", bool),  # the tag is at rest, see stationarity.py
     # m, x and y of the place on the ground where the lateness of anchors is known; NaN: anywhere

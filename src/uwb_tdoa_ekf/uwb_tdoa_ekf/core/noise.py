@@ -134,13 +134,13 @@ def persisting_share(ekf: Record, parameters: Record) -> float:
 
 
 @compiled
-def variance_inflation(ekf: Record, parameters: Record, t: float) -> float:
-    """Return the factor on the stated variance of a TDOA or range stamped t (s) in an update.
+def variance_inflation(ekf: Record, parameters: Record) -> float:
+    """Return the factor on the stated variance of a TDOA or range in an update.
 
-    It is noise_ratio, plus the persisting share times a number of TDOAs with the same error. At rest
-    these are all TDOAs of the rest. In motion errors of every duration occur, up to
-    tdoa_correlation_time and tdoa_correlation_distance. Then it is the square root of the number of
-    TDOAs within both. This power was set on measured flights, at 5 to 400 TDOAs a second.
+    It is noise_ratio, plus the persisting share times a number of TDOAs with the same error. Errors
+    of every duration occur, up to tdoa_correlation_time and tdoa_correlation_distance. So it is the
+    square root of the number of TDOAs within both. This power was set on measured flights, at 5 to
+    400 TDOAs a second. What persists is in the consider covariance: a tag at rest averages.
     """
     if not parameters.adapt_noise:
         return 1.0
@@ -150,8 +150,6 @@ def variance_inflation(ekf: Record, parameters: Record, t: float) -> float:
     if alike * speed > parameters.tdoa_correlation_distance:
         alike = parameters.tdoa_correlation_distance / speed
     count = math.sqrt(ekf.tdoa_rate * alike)
-    if ekf.resting:
-        count = max(count, ekf.tdoa_rate * (t - ekf.rest_since))
     return ekf.noise_ratio + persisting_share(ekf, parameters) * count
 
 

@@ -24,8 +24,9 @@ from .update import GATE, kalman_direct
 
 # m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
-# s of TDOAs in each check: the shorter window, or, if its TDOAs of a pair are too few, the longer
-LOOK_WINDOW, LONG_WINDOW = (0.4, 1.6)
+# s of TDOAs in each check: the shorter window, or, if its TDOAs of a pair are too few, the longer, or
+# all since the tag has been quiet, up to the longest
+LOOK_WINDOW, LONG_WINDOW, QUIET_WINDOW = (0.4, 1.6, 25.0)
 # checks in a row with changed TDOAs that end a rest: a check shows a change by chance in 1 of 20
 # cases; checks in a row without a change that begin a rest within EARLY
 FEWEST_CHECKS = 3
@@ -115,8 +116,8 @@ def check_stationarity(
     if not (ekf.resting or calm or stationary_position.is_near_ground(best, parameters)):
         return
     count, motion = 0, ground.UNKNOWN
-    for seconds in (LOOK_WINDOW, LONG_WINDOW):
-        if motion == ground.UNKNOWN:
+    for seconds in (LOOK_WINDOW, LONG_WINDOW, min(t - ekf.shaken, QUIET_WINDOW)):
+        if motion == ground.UNKNOWN and (seconds <= LONG_WINDOW or ekf.quiet):
             count = ground.find_pairs(recent(ekf, seconds), ekf.pairs)
             pairs, covariance = ekf.pairs[:count], ekf.still_covariance
             motion = ground.judge_motion(pairs, anchors, best.x[:3], covariance)
