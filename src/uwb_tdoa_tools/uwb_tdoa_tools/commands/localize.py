@@ -17,7 +17,8 @@ DESCRIPTION = """Where the tag was: trajectories of recordings, without ground t
 Runs bias correction and filter as the nodes would, or smooths. Writes for each recording to --out: NAME.tum (for evo), NAME.csv (with
 velocities and standard deviations) and NAME.png (from above, from the side, over time, with three standard deviations); with --bag
 NAME_bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a table and as a picture per pair of anchors; with --zones
-which anchors were heard where, and how well: a table and a map.
+which anchors were heard where, and how well: a table and a map. NAME_stays.csv has the visits to the --areas, and where the tag was parked
+(for 60 s or longer); of several tags, and with --areas, tags.png has all paths.
 
 It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
 of the time; doubtful: the filter was lost, or restarted, or many TDOAs contradict it; bad: check finds an error, or there is none.
@@ -39,6 +40,7 @@ def parser() -> ArgumentParser:
         "localize flight_bag --bag --json located.json --out out/",
         "localize flight_bag --rerun flight.rrd --out out/",
         "localize hall_bag --zones 20 --out out/",
+        "localize tag1_bag tag2_bag --areas areas.yaml --out out/",
         options=[
             *options.recordings(),
             *options.ESTIMATOR,
@@ -54,6 +56,11 @@ def parser() -> ArgumentParser:
                 type=float,
                 help="write who is heard in squares of that size, and how well, too: a table, and a map",
             ),
+            option(
+                "--areas",
+                metavar="FILE",
+                help="YAML file of named areas, name: [[x, y], ...] in m: write when the tag enters and leaves",
+            ),
             options.RERUN,
             option("--json", metavar="FILE", type=OutputFile, help="write all figures"),
             options.JOBS,
@@ -63,6 +70,7 @@ def parser() -> ArgumentParser:
 
 
 def _localize(args: Namespace) -> int:
+    from ..localizing import areas
     from ..localizing.localize import Localizer, all_good, check_names
 
     out = args.out
@@ -70,6 +78,7 @@ def _localize(args: Namespace) -> int:
         raise InputError(
             f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20."
         )
+    named = areas.read_areas(args.areas) if args.areas else {}
     say = partial(cli.say, "localize")
     estimator = options.estimator_of(args)
     reading = options.reading_of(args, truth=False)
@@ -80,13 +89,17 @@ def _localize(args: Namespace) -> int:
     cli.show(f"correcting with: {estimator.correction}")
     folder, located = out.absolute() if args.dask else out, []
     localizer = Localizer(
-        reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects
+        reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects, named
     )
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
         first, *others = one.assessment.sentences()
+        others += areas.sentences(one.stays)
         cli.show(f"{one.flight}: {first}", *(f"  {sentence}" for sentence in others))
         cli.show(f"  wrote {', '.join(path.name for path in one.written)} to {out}")
+    if len(located) > 1 or named:
+        areas.draw_tracks(out / "tags.png", {one.flight: one for one in located}, named)
+        cli.show(f"wrote tags.png to {out}")
     cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
     return int(not all_good(located))
 

@@ -8,7 +8,7 @@ The assessment uses the recording and the run, without ground truth.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 import math
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..scoring.metrics import LOST, has_innovation, nis, radio_residuals
-from . import pictures
+from . import areas, pictures
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
@@ -259,18 +259,23 @@ COLUMNS = (
     "std_vy",
     "std_vz",
     "std_yaw",
+    "circle",
 )
 SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
 
 def trajectory_rows(odometry: Odometry) -> np.ndarray:
-    """Return the COLUMNS of an Odometry, (n, 18), in the world frame.
+    """Return the COLUMNS of an Odometry, (n, 19), in the world frame.
 
-    Columns: s, m, quaternion from body to world, m/s, then standard deviations in m, m/s and rad.
+    Columns: s, m, quaternion from body to world, m/s, then standard deviations in m, m/s and rad, and
+    the radius in m of a circle about x and y that holds the tag for 95 % of the time.
     """
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance))
     yaw = rotation_std(odometry.q, odometry.covariance)[:, 2]
-    return np.column_stack([odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw])
+    circle = areas.circle_of(odometry.covariance)
+    return np.column_stack(
+        [odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw, circle]
+    )
 
 
 def write_trajectory(path: Path, odometry: Odometry) -> None:
@@ -303,11 +308,13 @@ def write_tum(path: str | Path, t: np.ndarray, p: np.ndarray, q: np.ndarray) -> 
 
 @dataclass(frozen=True)
 class Located:
-    """Result of a recording: name of its files, assessment, and the written files."""
+    """Result of a recording: name of its files, assessment, written files, track and stays."""
 
     flight: str
     assessment: Assessment
     written: tuple[Path, ...]
+    track: areas.Track
+    stays: tuple[areas.Stay, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
@@ -319,6 +326,7 @@ class Located:
             "lost_spans": assessment.lost,
             "reasons": list(assessment.reasons),
             "remedies": list(assessment.remedies),
+            "stays": [asdict(stay) for stay in self.stays],
             "files": [str(path) for path in self.written],
         }
 
@@ -338,6 +346,7 @@ class Localizer:
     rerun : file for Rerun, or None.
     zones : m, size of squares for a table of heard anchors, or None.
     effects : file with the effects of the estimator, or None.
+    areas : named polygons, whose visits are written.
     """
 
     reading: Reading
@@ -348,6 +357,7 @@ class Localizer:
     rerun: Path | None = None
     zones: float | None = None
     effects: str | None = None
+    areas: areas.Areas = field(default_factory=dict)
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
@@ -383,7 +393,12 @@ class Localizer:
         if self.rerun is not None:
             pictures.write_rerun(self.rerun, flight, odometry, left, assessment.sentences())
             written.append(self.rerun)
-        return Located(name, assessment, tuple(file for file in written if file.exists()))
+        track = areas.track_of(odometry)
+        stays = (*areas.visits(track, self.areas), *areas.parked(track))
+        if stays:
+            areas.write_stays(path("_stays.csv"), stays)
+        files = tuple(file for file in written if file.exists())
+        return Located(name, assessment, files, track, stays)
 
 
 def name_of(path: str | Path) -> str:
