@@ -36,7 +36,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message
 from uwb_tdoa_bias.ros.cdr import message_class
-from uwb_tdoa_bias.ros.topics import unserved, waiting
+from uwb_tdoa_bias.ros.node import unserved, waiting
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa
 from uwb_tdoa_tools.live.processes import (
     DiagnosticsListener,

@@ -22,7 +22,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.correction.model import NETWORK, Model  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
-from uwb_tdoa_bias.ros.parameters import BURST  # noqa: E402
+from uwb_tdoa_bias.ros.node import BURST  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "bias_node.yaml"

@@ -25,7 +25,7 @@ from sensor_msgs.msg import FluidPressure
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import LINE_LENGTH, InputError
-from uwb_tdoa_bias.ros import node as served, parameters, topics
+from uwb_tdoa_bias.ros import node as served, topics
 from uwb_tdoa_bias.ros.anchors import (
     ANCHORS_QOS,
     ANY_QOS,
@@ -35,15 +35,19 @@ from uwb_tdoa_bias.ros.anchors import (
 )
 from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.node import (
+    BURST,
+    MOST_ASKED,
+    MOST_REQUESTS,
     PERIOD,
+    REFILL,
     Elapsed,
+    Log,
     LogFilter,
     SimulatedClock,
     Spinner,
     StreamNode,
     StreamPoller,
 )
-from uwb_tdoa_bias.ros.parameters import BURST, MOST_ASKED, MOST_REQUESTS, REFILL, Log
 from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch, Streams
 
 # --- stamps ---
@@ -181,7 +185,7 @@ class Written:
 def clock(monkeypatch):
     """Return the time that a Log reads, in s, as a list of one element."""
     now = [1000.0]
-    monkeypatch.setattr(parameters.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(served.time, "monotonic", lambda: now[0])
     return now
 
 

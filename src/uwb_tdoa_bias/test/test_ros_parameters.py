@@ -10,7 +10,7 @@ from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 from rclpy.parameter import Parameter as Value  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.ros.parameters import (  # noqa: E402
+from uwb_tdoa_bias.ros.node import (  # noqa: E402
     Parameter,
     ParameterNode,
     declare_all,

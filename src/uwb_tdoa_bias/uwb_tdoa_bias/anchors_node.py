@@ -23,12 +23,13 @@ from uwb_tdoa_msgs.msg import AnchorArray
 from .common.errors import InputError
 from .common.survey import read_survey
 from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, TF_STATIC_QOS, anchors_to_message
-from .ros.node import StreamNode, run
-from .ros.parameters import (
+from .ros.node import (
     FROZEN,
     Parameter,
+    StreamNode,
     declare_all,
     refuse_unknown,
+    run,
 )
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml

@@ -42,12 +42,17 @@ from .effects.base import relabelled
 from .effects.tag import TagLeverArm
 from .ros.anchors import ANCHORS_FILE, MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
 from .ros.cdr import CdrCodec, CdrTemplate
-from .ros.node import Diagnostics, Rate, Report, StreamNode, StreamPoller, run
-from .ros.parameters import (
+from .ros.node import (
     FROZEN,
+    Diagnostics,
     Parameter,
+    Rate,
+    Report,
+    StreamNode,
+    StreamPoller,
     declare_all,
     refuse_unknown,
+    run,
 )
 from .ros.topics import Epoch, StreamOutput, Streams, several_publishers
 

@@ -23,12 +23,15 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE, AnchorsInput
-from uwb_tdoa_bias.ros.node import Diagnostics, Rate, StreamNode, run
-from uwb_tdoa_bias.ros.parameters import (
+from uwb_tdoa_bias.ros.node import (
     FROZEN,
+    Diagnostics,
     Parameter,
+    Rate,
+    StreamNode,
     declare_all,
     refuse_unknown,
+    run,
 )
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 

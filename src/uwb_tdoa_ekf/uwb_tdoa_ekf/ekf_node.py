@@ -38,8 +38,15 @@ from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.ros.anchors import MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
-from uwb_tdoa_bias.ros.node import Diagnostics, Elapsed, Report, StreamNode, StreamPoller, run
-from uwb_tdoa_bias.ros.parameters import refuse_unknown
+from uwb_tdoa_bias.ros.node import (
+    Diagnostics,
+    Elapsed,
+    Report,
+    StreamNode,
+    StreamPoller,
+    refuse_unknown,
+    run,
+)
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 

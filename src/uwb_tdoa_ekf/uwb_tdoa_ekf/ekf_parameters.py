@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE
-from uwb_tdoa_bias.ros.parameters import FROZEN, Parameter, ParameterNode, declare, declare_all
+from uwb_tdoa_bias.ros.node import FROZEN, Parameter, ParameterNode, declare, declare_all
 
 from .core.config import CHOICES, FilterConfig
 

@@ -28,11 +28,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.ros.node import Diagnostics, Report, StreamNode, StreamPoller, run
-from uwb_tdoa_bias.ros.parameters import (
+from uwb_tdoa_bias.ros.node import (
     FROZEN,
+    Diagnostics,
     Parameter,
+    Report,
+    StreamNode,
+    StreamPoller,
     declare_all,
+    run,
 )
 from uwb_tdoa_bias.ros.topics import InMemoryReceiver
 

@@ -16,7 +16,7 @@ from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import Failure  # noqa: E402
-from uwb_tdoa_bias.ros.parameters import Parameter, declare_all  # noqa: E402
+from uwb_tdoa_bias.ros.node import Parameter, declare_all  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 SCRIPT = runpy.run_path(str(ROOT / ".dev" / "ros2.py"))

@@ -27,7 +27,6 @@ ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.ros.anchors uwb_tdoa_bias.ros.cdr
     uwb_tdoa_bias.ros.node
-    uwb_tdoa_bias.ros.parameters
     uwb_tdoa_bias.ros.topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
     uwb_tdoa_ekf.launching

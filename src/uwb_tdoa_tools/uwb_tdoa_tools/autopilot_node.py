@@ -24,11 +24,14 @@ import numpy as np
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
-from uwb_tdoa_bias.ros.node import Diagnostics, Rate, StreamNode, run
-from uwb_tdoa_bias.ros.parameters import (
+from uwb_tdoa_bias.ros.node import (
+    Diagnostics,
     Parameter,
+    Rate,
+    StreamNode,
     declare_all,
     refuse_unknown,
+    run,
 )
 from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 from uwb_tdoa_msgs.msg import EstimatorStatus

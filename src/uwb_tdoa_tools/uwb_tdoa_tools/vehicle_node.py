@@ -27,11 +27,13 @@ from std_msgs.msg import String
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
-from uwb_tdoa_bias.ros.node import StreamNode, StreamPoller, run
-from uwb_tdoa_bias.ros.parameters import (
+from uwb_tdoa_bias.ros.node import (
     Parameter,
+    StreamNode,
+    StreamPoller,
     declare_all,
     refuse_unknown,
+    run,
 )
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 

@@ -23,8 +23,7 @@ from ..common.anchors import MOST_NAMED, SAME_PLACE, Anchors, refuse_faulty
 from ..common.errors import InputError
 from ..common.survey import read_survey
 from ..common.transforms import Frames
-from .node import StreamNode
-from .parameters import MOST_QUOTED, Parameter
+from .node import MOST_QUOTED, Parameter, StreamNode
 from .topics import Input, Refusals, publishers_of
 
 ANCHORS_QOS = QoSProfile(

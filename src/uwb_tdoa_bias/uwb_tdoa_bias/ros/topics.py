@@ -8,7 +8,7 @@ rows and stamps in s.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from copy import copy
 import time
 from typing import Any, TypeVar, overload
@@ -19,12 +19,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from ..common.stamps import LARGEST_STEP_BACK
 from .cdr import CdrCodec, CdrTemplate, Message, Unreadable, decode, name_of
-from .parameters import ParameterNode
+from .node import ParameterNode, unserved, waiting
 
 # frame, stamps, rows and arrivals
 Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]
@@ -91,17 +90,6 @@ def publish_stream(node: Node, kind: type, topic: str) -> Publisher:
     QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth.
     """
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
-
-
-def unserved(_: Any) -> None:
-    """Mark a subscription that no executor serves; a callback without effect."""
-
-
-def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Take and yield (bytes, information) of each message at an unserved subscription."""
-    kind, take = subscription.msg_type, subscription.handle.take_message
-    while (taken := take(kind, True)) is not None:
-        yield taken
 
 
 class Refusals:
