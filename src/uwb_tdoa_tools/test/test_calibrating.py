@@ -471,7 +471,7 @@ def test_the_line_that_judges_reads_as_the_command_did():
 
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
-    flight, findings = flights[0], [Finding(library.report.MISFIT, ERROR, "", "", "", 0.0)]
+    flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
     assert library.blocking_errors(of_flight(flight), findings, 0.1) == []
     far = flight.anchors.at(
         flight.anchors.positions

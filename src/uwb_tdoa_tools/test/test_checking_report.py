@@ -11,7 +11,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import diagnosis
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.checking.report import survey_remarks
+from uwb_tdoa_tools.checking.check import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

@@ -22,8 +22,7 @@ from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.results import rows_of
 
 from . import cli, command_lines
-from .checking import report
-from .checking.check import check, different_surveys
+from .checking.check import MISFIT, check, different_surveys, misfit_beyond, remark_on_surveys
 from .checking.recording import Recording, read_recording
 from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
@@ -127,8 +126,8 @@ def blocking_errors(recording: Recording, findings: Iterable[Finding], std: floa
     These are all errors, except for a survey within the accuracy `std`, m, of a coordinate.
     """
     errors = [finding for finding in findings if finding.severity == ERROR]
-    if report.misfit_beyond(recording, errors, std) is None:
-        errors = [finding for finding in errors if finding.rule != report.MISFIT]
+    if misfit_beyond(recording, errors, std) is None:
+        errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors
 
 
@@ -165,7 +164,7 @@ def usable_paths(
             recording = read_recording(reading, path, survey)
             line = command_lines.survey_line(path, survey, effects)
             result = check(recording, (), estimator, line)
-            cli.show(report.text(result))
+            cli.show(result.text())
             remarks = estimator.remarks(recording.anchors)
             cli.say("calibrate", *(f"{recording.name}: {remark}" for remark in remarks))
             errors = blocking_errors(recording, result.findings, std)
@@ -183,7 +182,7 @@ def usable_paths(
     for finding in different_surveys(list(usable.values())):
         raise InputError(f"{finding.cause}: {finding.evidence}; {finding.remedy}.")
     surveys = [survey for path, survey in (*found, *held) if path in usable]
-    cli.say("calibrate", *report.remark_on_surveys(surveys, list(usable.values())))
+    cli.say("calibrate", *remark_on_surveys(surveys, list(usable.values())))
     paths, judges = ([path for path, _ in some if path in usable] for some in recordings)
     if held and paths and not judges:
         cli.say("calibrate", "no flight of --holdout is left: the last of the others judges.")

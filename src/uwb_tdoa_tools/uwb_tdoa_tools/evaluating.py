@@ -18,11 +18,9 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
 from .bags.bag import RecordedOdometry, late_tdoas, read_odometry
-from .checking.check import check
-from .checking.flight_rules import judge_truth
+from .checking.check import check, judge_truth, survey_remarks
 from .checking.motion_rules import judge_imu
 from .checking.recording import of_flight
-from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
 from .choices import ALIGN, FRAME, NONE, TIME
 from .cli import file_name

@@ -66,8 +66,7 @@ def parser() -> ArgumentParser:
 def _check(args: Namespace) -> int:
     from uwb_tdoa_bias.common.survey import read_named_anchors
 
-    from ..checking import report
-    from ..checking.check import check, different_surveys
+    from ..checking.check import as_dict, check, different_surveys, lines
     from ..estimate import FlightEstimator
 
     if bool(args.flights) == (args.live is not None):
@@ -86,11 +85,11 @@ def _check(args: Namespace) -> int:
         cli.say("check", *(f"{recording.name}: {remark}" for remark in remarks))
         line = command_lines.survey_line(path, survey, args.effects) if path else None
         reports.append(check(recording, others, estimator, line))
-        cli.show(report.text(reports[-1]))
+        cli.show(reports[-1].text())
     together = list(different_surveys(recordings))
     for finding in together:
-        cli.show(*report.lines(finding))
-    cli.write_json(args.json, report.as_dict(reports, together))
+        cli.show(*lines(finding))
+    cli.write_json(args.json, as_dict(reports, together))
     return int(any(one.faulty for one in reports))
 
 

@@ -138,7 +138,7 @@ def parser() -> ArgumentParser:
 def _diagnose(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.report import nothing_comes_first, remarks_on
+    from ..checking.check import nothing_comes_first, remarks_on
     from ..diagnosis import diagnose, output, references, with_noise
     from ..diagnosis.motions import Limits, motions
     from ..diagnosis.next_flight import plan_flight

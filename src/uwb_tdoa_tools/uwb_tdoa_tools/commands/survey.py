@@ -62,7 +62,7 @@ def parser() -> ArgumentParser:
 def _survey(args: Namespace) -> int:
     from uwb_tdoa_bias.effects import EffectSet
 
-    from ..checking.report import nothing_comes_first, remark_on_surveys
+    from ..checking.check import nothing_comes_first, remark_on_surveys
     from ..diagnosis.noise import has_imu, write_parameters
     from ..diagnosis.self_calibration import self_calibrate
     from ..estimate import FlightEstimator

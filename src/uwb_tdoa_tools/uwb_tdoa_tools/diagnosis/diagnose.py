@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
-from ..checking.flight_rules import judge_flight
+from ..checking.check import judge_flight
 from ..parallel import MapFunction
 from ..scoring.metrics import LOSS, Score, gain, radio_residuals
 from . import comparison, repairing, validation
