@@ -22,7 +22,7 @@ import numpy as np
 from rcl_interfaces.srv import GetParameters
 import rclpy
 
-from uwb_tdoa_tools.live.processes import LiveError
+from uwb_tdoa_tools.live.session import LiveError
 
 from .figures import Figure
 from .nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from rclpy.node import Node
 
-    from uwb_tdoa_tools.live.processes import Processes
+    from uwb_tdoa_tools.live.session import Processes
 
 CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, number of busy processes
     (0.0, 0.0, False, 0),

@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_tools.live.processes import (
+from uwb_tdoa_tools.live.session import (
     DiagnosticsListener,
     Processes,
     accounts,
     own_domain,
+    session,
     variables,
     wait,
 )
-from uwb_tdoa_tools.live.session import session
 
 from .figures import Figure
 from .flights import among, make_flight

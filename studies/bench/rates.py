@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_tools.bags.bag import read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import open_bag
-from uwb_tdoa_tools.live.processes import accounts, run_live
+from uwb_tdoa_tools.live.session import accounts, run_live
 
 from .figures import Figure
 from .flights import make_flight

@@ -10,7 +10,7 @@ from pathlib import Path
 import tempfile
 import time
 
-from uwb_tdoa_tools.live.processes import DiagnosticsListener, wait
+from uwb_tdoa_tools.live.session import DiagnosticsListener, wait
 
 from . import nodes
 from .flights import make_flight

@@ -38,14 +38,14 @@ from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, TF_STATIC_QOS, anchors_to_mes
 from uwb_tdoa_bias.ros.cdr import message_class
 from uwb_tdoa_bias.ros.node import unserved, waiting
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa
-from uwb_tdoa_tools.live.processes import (
+from uwb_tdoa_tools.live.session import (
     DiagnosticsListener,
     LiveError,
     Processes,
     own_domain,
+    session,
     wait,
 )
-from uwb_tdoa_tools.live.session import session
 
 from .events import Event
 

@@ -12,8 +12,7 @@ from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
-from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
-from uwb_tdoa_tools.live.session import session
+from uwb_tdoa_tools.live.session import Processes, own_domain, session, wait
 
 # s, limit of each wait; the first start compiles the filter and the vehicle
 PATIENCE = 400.0

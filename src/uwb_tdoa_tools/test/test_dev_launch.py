@@ -16,8 +16,11 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from uwb_tdoa_bias.common.errors import Failure, InputError  # noqa: E402
 from uwb_tdoa_ekf.launching import LAUNCH_FILES, start  # noqa: E402
-from uwb_tdoa_tools.live.processes import own_domain  # noqa: E402
-from uwb_tdoa_tools.live.session import parameter_of, session  # noqa: E402
+from uwb_tdoa_tools.live.session import (  # noqa: E402
+    own_domain,  # noqa: E402
+    parameter_of,
+    session,
+)
 from uwb_tdoa_tools.simulation.config import corners
 
 FILE = ROOT / ".dev" / "launch.py"

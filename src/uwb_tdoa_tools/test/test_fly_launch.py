@@ -13,7 +13,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_ekf" / "test
 
 from real_launch import WHY_NOT, Launch  # noqa: E402
 
-from uwb_tdoa_tools.live.processes import own_domain  # noqa: E402
+from uwb_tdoa_tools.live.session import own_domain  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))]
 

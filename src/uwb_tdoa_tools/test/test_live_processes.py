@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
 
-from uwb_tdoa_tools.live import processes  # noqa: E402
+from uwb_tdoa_tools.live import session as live  # noqa: E402
 
 
 @pytest.fixture
@@ -24,10 +24,10 @@ def start(tmp_path, monkeypatch):
     """
     folder = tmp_path / "lib" / "some_package"
     folder.mkdir(parents=True)
-    monkeypatch.setattr(processes, "get_package_prefix", lambda package: str(tmp_path))
+    monkeypatch.setattr(live, "get_package_prefix", lambda package: str(tmp_path))
     asked = []
 
-    with processes.Processes(tmp_path, asked) as started:
+    with live.Processes(tmp_path, asked) as started:
 
         def start(name, *lines, **options):
             (folder / name).write_text("\n".join(("#!/bin/sh", *lines, "")))
@@ -62,7 +62,7 @@ def test_a_process_that_ends_with_another_code_than_it_may_is_named(
     start, lines, may_end_with, said
 ):
     start("node", *lines, may_end_with=may_end_with).wait(120)
-    with pytest.raises(processes.LiveError, match=said) if said else nullcontext():
+    with pytest.raises(live.LiveError, match=said) if said else nullcontext():
         start.processes.check()
 
 
@@ -75,10 +75,10 @@ def test_stop_interrupts_the_whole_group(start, tmp_path):
 
 
 def test_a_process_that_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
-    monkeypatch.setattr(processes, "PATIENCE", 0.2)
+    monkeypatch.setattr(live, "PATIENCE", 0.2)
     node = start("node", "trap '' INT", "echo ready", "while true; do sleep 1; done")
     wait_for_output(tmp_path / "node.log", "ready")
-    with pytest.raises(processes.LiveError, match="node ended with code -9"):
+    with pytest.raises(live.LiveError, match="node ended with code -9"):
         start.processes.stop("node")
     assert node.returncode == -signal.SIGKILL
 
@@ -87,7 +87,7 @@ def test_domains_are_drawn_at_random():
     """With a fixed domain, a run could receive messages of the previous run."""
 
     def number():
-        with processes.own_domain():
+        with live.own_domain():
             return os.environ["ROS_DOMAIN_ID"]
 
     assert len({number() for _ in range(8)}) > 1
@@ -113,8 +113,8 @@ class NobodySpeaks:
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(processes, "rclpy", NobodySpeaks)
-    monkeypatch.setattr(processes, "LOOK", 0.2)
+    monkeypatch.setattr(live, "rclpy", NobodySpeaks)
+    monkeypatch.setattr(live, "LOOK", 0.2)
 
 
 COMPILING = ("echo 'compiling, which is done once: 40%, 20 s'", "while true; do :; done")
@@ -126,7 +126,7 @@ def test_a_process_that_compiles_is_waited_for_without_limit(start, quick, tmp_p
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
     until, told = time.monotonic() + 2.5, []
-    processes.wait(
+    live.wait(
         1.0,
         "the node",
         start.processes,
@@ -147,16 +147,16 @@ def test_without_progress_the_wait_ends(start, quick, tmp_path, lines):
     if READY in lines:
         wait_for_output(tmp_path / "node.log", "ready")
     with pytest.raises(
-        processes.LiveError, match=r"waited 0.5 s for the node, and nothing went on \(node: "
+        live.LiveError, match=r"waited 0.5 s for the node, and nothing went on \(node: "
     ):
-        processes.wait(0.5, "the node", start.processes, None, lambda: False)
+        live.wait(0.5, "the node", start.processes, None, lambda: False)
 
 
 @pytest.mark.slow
 def test_changing_counters_extend_the_wait(start, quick):
     start("node", READY, "sleep 600")
     until = time.monotonic() + 2.0
-    processes.wait(
+    live.wait(
         0.5,
         "the counts",
         start.processes,
@@ -191,7 +191,7 @@ def status(node, **values):
 
 
 def test_settled_when_every_node_repeats_its_counts():
-    diagnostics = processes.DiagnosticsListener(node := NoNode())
+    diagnostics = live.DiagnosticsListener(node := NoNode())
     diagnostics._take(status("bias_node", received=5, rate="3.0 Hz"))
     diagnostics._take(status("ekf_node", received=4, rate="3.0 Hz"))
     node.queue.messages += ["said before", "said before, too"]

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy")
 from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_tools.flying.demo import LivePass  # noqa: E402
-from uwb_tdoa_tools.live import processes as live
+from uwb_tdoa_tools.live import session as live
 
 
 def test_the_nodes_wait_for_a_slow_replay():

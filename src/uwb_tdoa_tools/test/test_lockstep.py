@@ -26,17 +26,15 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: 
 from uwb_tdoa_tools.bags.files import new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.messages import typestore  # noqa: E402
 from uwb_tdoa_tools.calibrating import between  # noqa: E402
-from uwb_tdoa_tools.live.processes import (  # noqa: E402
+from uwb_tdoa_tools.live.replay import SILENCE  # noqa: E402
+from uwb_tdoa_tools.live.session import (  # noqa: E402
     DiagnosticsListener,
     Processes,
     _parameters,
     own_domain,
-    wait,
-)
-from uwb_tdoa_tools.live.replay import SILENCE  # noqa: E402
-from uwb_tdoa_tools.live.session import (
     recorded_odometry,
     session,  # noqa: E402
+    wait,
 )
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402

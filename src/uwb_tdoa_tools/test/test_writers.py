@@ -21,7 +21,7 @@ SOURCES = [
 ELSEWHERE = {  # these files are not handed to a user directly
     "uwb_tdoa_bias/common/files.py",
     "uwb_tdoa_tools/bags/files.py",  # files unpacked in a temporary folder
-    "uwb_tdoa_tools/live/processes.py",  # output of a process
+    "uwb_tdoa_tools/live/session.py",  # output of a process
     "studies/fuzz.py",  # input of a reader, in a temporary folder
 }
 WRITING = re.compile("(?=.*[wax+])[rwaxbt+]{1,3}")  # a mode of `open`

@@ -278,7 +278,7 @@ def through_nodes(
     InputError, LiveError
         If the flight cannot be played.
     """
-    from ..live.processes import accounts, run_live
+    from ..live.session import accounts, run_live
 
     folder.mkdir(parents=True, exist_ok=True)
     # a node runs in another directory

@@ -28,21 +28,23 @@ from rosgraph_msgs.msg import Clock
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.ros.node import waiting
 
 from ..bags.files import BagReader, open_bag
 from ..choices import WAIT
-from .processes import LOOK, SETTLE_LIMIT, DiagnosticsListener
 from .session import (
     ANSWER_LIMIT,
+    LOOK,
     READER_DEPTH,
+    SETTLE_LIMIT,
     SPIN,
+    DiagnosticsListener,
     Stop,
     message_class,
     parameter_of,
     publisher_qos,
     session,
     subscription_qos,
-    taken,
     wait_for_names,
 )
 
@@ -232,7 +234,7 @@ class _Topic:
 
     def stamps(self) -> list[int]:
         """Return the stamps, ns, of the messages that have arrived."""
-        found = [stamp_of(data) for data, _ in taken(self._subscription)]
+        found = [stamp_of(data) for data, _ in waiting(self._subscription)]
         self.silent = self.silent and not found
         return found
 
