@@ -24,11 +24,10 @@ import traceback
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.errors import Failure, InputError
 from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_bias.common.flight import Flight, Tdoas
-from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml
 from uwb_tdoa_bias.common.survey import NamedAnchors, read_named_anchors
 from uwb_tdoa_bias.correction.model import Network

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from uwb_tdoa_bias.common import files
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.errors import YAML_BYTES, InputError, printable, sanitize
 from uwb_tdoa_bias.common.files import (
     protected_inputs,
@@ -32,7 +32,6 @@ from uwb_tdoa_bias.common.files import (
     write_text,
 )
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.safe_yaml import parse_yaml, read_yaml
 
 # --- files ---

@@ -11,8 +11,10 @@ from types import SimpleNamespace  # noqa: E402
 
 import numpy as np  # noqa: E402
 
-from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_bias.common.anchors import (
+    Anchors,  # noqa: E402
+    FlyableVolume,  # noqa: E402
+)
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.monitoring.finding import Finding  # noqa: E402

@@ -38,7 +38,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import FlyableVolume
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD, Corrector
 from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm

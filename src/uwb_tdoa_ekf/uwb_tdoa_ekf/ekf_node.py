@@ -28,9 +28,8 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.transforms import Place
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD

@@ -20,8 +20,8 @@ import pytest
 from uwb_tdoa_bias.common import executable
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_tools.cli import Progress
 from uwb_tdoa_tools.options import JOBS
-from uwb_tdoa_tools.parallel import Progress
 
 
 def times_ten(number):
@@ -247,7 +247,7 @@ class Terminal(Lines):
 @pytest.fixture
 def often(monkeypatch):
     for name in ("FIRST", "EVERY", "OFTEN"):
-        monkeypatch.setattr(parallel, name, 0.01)
+        monkeypatch.setattr(cli, name, 0.01)
 
 
 def test_progress_shows_the_work_and_its_share(often):
@@ -271,7 +271,7 @@ def test_progress_shows_what_compiles(often, monkeypatch):
 
 def test_short_work_prints_no_progress(monkeypatch):
     # short also on a loaded machine
-    monkeypatch.setattr(parallel, "FIRST", 600.0)
+    monkeypatch.setattr(cli, "FIRST", 600.0)
     lines = Lines(1)
     with Progress("weigh", stream=lines):
         pass

@@ -7,8 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import plan

@@ -10,8 +10,8 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.survey import read_survey
+from uwb_tdoa_tools.cli import Progress
 from uwb_tdoa_tools.commands.plan import main
-from uwb_tdoa_tools.parallel import Progress
 from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid, Hall
 from uwb_tdoa_tools.planning.optimisation import best_addition, with_one
 from uwb_tdoa_tools.planning.precision import Installation

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.messages import typestore
-from uwb_tdoa_tools.planning import plots
+from uwb_tdoa_tools.planning import report
 from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     OUTSIDE,
@@ -267,7 +267,7 @@ def figures(monkeypatch):
     def write(path, figure, dpi):
         made.append((figure, figure.get_suptitle()))
 
-    monkeypatch.setattr(plots, "write_picture", write)
+    monkeypatch.setattr(report, "write_picture", write)
     return made
 
 
@@ -285,7 +285,7 @@ def test_what_the_title_calls_hatched_is_hatched(found, flyable, figures):
         if not flyable
         else found
     )
-    plots.plot_layouts(
+    report.plot_layouts(
         [("before", Installation(corners()), one), ("after", Installation(corners()), one)],
         FLOWN,
         None,
@@ -297,7 +297,7 @@ def test_what_the_title_calls_hatched_is_hatched(found, flyable, figures):
 
 def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures):
     one = replace(found, status=np.where(np.arange(len(found.status)) % 4 == 0, IMPRECISE, 0))
-    plots.plot_flyable(corners(), one, None)
+    report.plot_flyable(corners(), one, None)
     (_, title), texts = (
         figures[0],
         [text.get_text() for text in figures[0][0].legends[0].get_texts()],
@@ -313,10 +313,10 @@ def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures)
 @pytest.mark.slow
 def test_every_picture_is_700_pixels_wide(found, tmp_path):
     anchors = corners()
-    plots.plot_precision(anchors, found, tmp_path / "precision.png")
-    plots.plot_flyable(anchors, found, tmp_path / "flyable.png", pairings=Installation(anchors))
-    plots.plot_heard(anchors, found, tmp_path / "heard.png")
-    plots.plot_layouts(
+    report.plot_precision(anchors, found, tmp_path / "precision.png")
+    report.plot_flyable(anchors, found, tmp_path / "flyable.png", pairings=Installation(anchors))
+    report.plot_heard(anchors, found, tmp_path / "heard.png")
+    report.plot_layouts(
         [("before", Installation(anchors), found)] * 2, FLOWN, tmp_path / "layout.png"
     )
     for path in tmp_path.iterdir():

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.correction.model import FEATURES, Network
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.scoring.metrics import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models
-from uwb_tdoa_tools.training.labels import labels, split, thinned, white_noise
+from uwb_tdoa_tools.training.models import labels, split, thinned, white_noise
 
 # --- labels ---
 

@@ -35,7 +35,7 @@ from .diagnosis.self_calibration.equations import slow_innovations
 from .diagnosis.self_calibration.solve import CLEARLY_OF_RANGES, IMPROVED, LEFT, MEASURE
 from .diagnosis.validation import cross_fitted
 from .estimate import FlightEstimator
-from .parallel import MapFunction, Progress
+from .parallel import MapFunction
 from .readers.inputs import Reading, Recording as ReadingPair
 from .scoring.metrics import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
@@ -159,7 +159,7 @@ def usable_paths(
     """
     found, held = recordings
     usable: dict[Path, Recording] = {}
-    with Progress("calibrate", len(found) + len(held), "recording") as progress:
+    with cli.Progress("calibrate", len(found) + len(held), "recording") as progress:
         for path, survey in (*found, *held):
             recording = read_recording(reading, path, survey)
             line = command_lines.survey_line(path, survey, effects)

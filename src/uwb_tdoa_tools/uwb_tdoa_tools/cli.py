@@ -1,12 +1,15 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Share the look of --help, the handling of failures, and the checks of output files, between all executables.
+"""Share the look of --help, progress, failures, and the checks of output files, between all executables.
 
 def parser():
     example = "convert flight.log --out flight_bag"
     return cli.parser("convert", "Convert a log to a bag.", example, options=[cli.option("log")])
 
 main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
+
+with Progress("convert") as progress:            # a thread prints
+    progress("reading")
 """
 
 from __future__ import annotations
@@ -22,11 +25,14 @@ import os
 from pathlib import Path
 import sys
 import tempfile
-from typing import Any
+from threading import Event, Thread
+import time
+from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
 from uwb_tdoa_bias.common.errors import Failure, InputError, line_of, printable, written_by
+from uwb_tdoa_bias.common.executable import COMPILING
 from uwb_tdoa_bias.common.files import protected_inputs, refuse_output, write_text
 
 from . import command_lines
@@ -37,6 +43,11 @@ FULL = {
     errno.EFBIG: "the file may not become larger",
 }
 
+
+Item = TypeVar("Item")
+
+FIRST, EVERY = 0.5, 10.0  # s until the first line where there is no terminal, and between two
+OFTEN = 0.5  # s between two changes of the line on a terminal
 
 # adds one or several options to a parser, or to a group of options
 Option = Callable[[argparse._ActionsContainer], object]
@@ -334,3 +345,96 @@ def as_json(value: Any) -> Any:
     if isinstance(value, (float, np.floating)):
         return float(value) if np.isfinite(value) else None
     return value
+
+
+class Progress:
+    """Show the current work, its share and its duration until the context ends.
+
+    On a terminal tqdm updates one line. Elsewhere a line appears every few seconds, which tqdm cannot
+    do. Work shorter than FIRST prints nothing. Call it with the current work as often as you like.
+    """
+
+    def __init__(
+        self,
+        name: str = "",
+        total: int | None = None,
+        unit: str = "",
+        stream: TextIO | None = None,
+        what: str = "",
+    ) -> None:
+        """Set the texts.
+
+        Parameters
+        ----------
+        name : str
+            Beginning of each line.
+        total : int or None
+            Number of units to process.
+        unit : str
+            Name of a unit.
+        stream : file or None
+            Default: stderr.
+        what : str
+            The first work.
+        """
+        self._name, self._total, self._unit, self._stream = name, total, unit, stream
+        self._what, self._done, self._ended = what, 0, Event()
+
+    def __call__(self, what: str) -> None:
+        self._what = what
+
+    def update(self) -> None:
+        """Count another unit as done."""
+        self._done += 1
+        if self._bar is not None and self._total is not None:
+            self._bar.update()
+
+    def over(self, items: Iterable[Item], what: str) -> Iterator[Item]:
+        """Yield the items, and show how many are done."""
+        items = list(items)
+        for done, item in enumerate(items):
+            self(f"{what}, {done} of {len(items)} done")
+            yield item
+        self(f"{what} done, finishing")
+
+    def __enter__(self) -> Progress:
+        stream = self._stream or sys.stderr
+        self._start, self._bar = time.monotonic(), None
+        if stream.isatty():
+            from tqdm import tqdm
+
+            form = (
+                {"bar_format": "{desc}"}
+                if self._total is None
+                else {"desc": self._name or None, "unit": self._unit}
+            )
+            self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
+        self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
+        self._thread.start()
+        COMPILING.shown = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        COMPILING.shown = False
+        self._ended.set()
+        self._thread.join()
+        if self._bar is not None:
+            self._bar.close()
+
+    def _tell(self, stream: TextIO) -> None:
+        """Print lines until the end, in a separate thread."""
+        pause = FIRST if self._bar is None else OFTEN
+        while not self._ended.wait(pause):
+            if self._bar is None:
+                pause = EVERY
+                print(self._line(), file=stream, flush=True)
+            elif self._total is None:
+                self._bar.set_description_str(self._line())
+            else:
+                self._bar.set_postfix_str(COMPILING.text)
+
+    def _line(self) -> str:
+        share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
+        took = f"{time.monotonic() - self._start:.0f} s"
+        parts = filter(None, (self._what, share, took, COMPILING.text))
+        return f"{self._name}: " * bool(self._name) + ", ".join(parts)

@@ -1,11 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run one function over many flights, on every core or on an existing Dask cluster; show progress.
+"""Run one function over many flights, on every core or on an existing Dask cluster.
 
     for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
         ...
-    with Progress("diagnose") as progress:                               # a thread prints
-        progress("looking at ids")
 
 The processes are kept for later calls if each call ends normally. A caller that stops before the
 last result ends them too.
@@ -20,118 +18,19 @@ from functools import cache, partial
 import os
 import signal
 import sys
-from threading import Event, Thread
-import time
-from typing import Any, Protocol, TextIO, TypeVar
+from typing import Any, Protocol, TypeVar
 import warnings
 
 from uwb_tdoa_bias.common import executable
 from uwb_tdoa_bias.common.errors import InputError
 
-Item = TypeVar("Item")
-
-FIRST, EVERY = 0.5, 10.0  # s until the first line where there is no terminal, and between two
-OFTEN = 0.5  # s between two changes of the line on a terminal
-# flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
-FEW = 20
-
-
-class Progress:
-    """Show the current work, its share and its duration until the context ends.
-
-    On a terminal tqdm updates one line. Elsewhere a line appears every few seconds, which tqdm cannot
-    do. Work shorter than FIRST prints nothing. Call it with the current work as often as you like.
-    """
-
-    def __init__(
-        self,
-        name: str = "",
-        total: int | None = None,
-        unit: str = "",
-        stream: TextIO | None = None,
-        what: str = "",
-    ) -> None:
-        """Set the texts.
-
-        Parameters
-        ----------
-        name : str
-            Beginning of each line.
-        total : int or None
-            Number of units to process.
-        unit : str
-            Name of a unit.
-        stream : file or None
-            Default: stderr.
-        what : str
-            The first work.
-        """
-        self._name, self._total, self._unit, self._stream = name, total, unit, stream
-        self._what, self._done, self._ended = what, 0, Event()
-
-    def __call__(self, what: str) -> None:
-        self._what = what
-
-    def update(self) -> None:
-        """Count another unit as done."""
-        self._done += 1
-        if self._bar is not None and self._total is not None:
-            self._bar.update()
-
-    def over(self, items: Iterable[Item], what: str) -> Iterator[Item]:
-        """Yield the items, and show how many are done."""
-        items = list(items)
-        for done, item in enumerate(items):
-            self(f"{what}, {done} of {len(items)} done")
-            yield item
-        self(f"{what} done, finishing")
-
-    def __enter__(self) -> Progress:
-        stream = self._stream or sys.stderr
-        self._start, self._bar = time.monotonic(), None
-        if stream.isatty():
-            from tqdm import tqdm
-
-            form = (
-                {"bar_format": "{desc}"}
-                if self._total is None
-                else {"desc": self._name or None, "unit": self._unit}
-            )
-            self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
-        self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
-        self._thread.start()
-        executable.COMPILING.shown = True
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        executable.COMPILING.shown = False
-        self._ended.set()
-        self._thread.join()
-        if self._bar is not None:
-            self._bar.close()
-
-    def _tell(self, stream: TextIO) -> None:
-        """Print lines until the end, in a separate thread."""
-        pause = FIRST if self._bar is None else OFTEN
-        while not self._ended.wait(pause):
-            if self._bar is None:
-                pause = EVERY
-                print(self._line(), file=stream, flush=True)
-            elif self._total is None:
-                self._bar.set_description_str(self._line())
-            else:
-                self._bar.set_postfix_str(executable.COMPILING.text)
-
-    def _line(self) -> str:
-        share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
-        took = f"{time.monotonic() - self._start:.0f} s"
-        parts = filter(None, (self._what, share, took, executable.COMPILING.text))
-        return f"{self._name}: " * bool(self._name) + ", ".join(parts)
-
-
-CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
+from .cli import Item, Progress
 
 Made = TypeVar("Made")
+
+CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
+# flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
+FEW = 20
 
 
 class MapFunction(Protocol):

@@ -11,7 +11,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
-from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import FlyableVolume
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.ros.node import Rate, Report
 

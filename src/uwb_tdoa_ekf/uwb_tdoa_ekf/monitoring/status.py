@@ -11,8 +11,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.sensors import LOCATING
 
 from ..core.yaw_check import YAW_KNOWN

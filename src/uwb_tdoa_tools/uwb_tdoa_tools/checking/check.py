@@ -34,9 +34,7 @@ from uwb_tdoa_ekf.monitoring.finding import (
 from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from .. import cli, command_lines
-from ..cli import as_json
 from ..estimate import FlightEstimator
-from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..readers.streams import protocol
 from . import coverage, imu_rules, motion_rules, pair_rules, recording_rules, tdoa_rules, time_rules
@@ -570,7 +568,7 @@ def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str,
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
-    return as_json(asdict(finding))
+    return cli.as_json(asdict(finding))
 
 
 SHORTEST = 10.0  # s; shorter flights get no remark
@@ -653,7 +651,7 @@ def nothing_comes_first(
     std : standard deviation of a coordinate of an anchor as given, m
     """
     found, misfits = [], []
-    with Progress(command) as progress:
+    with cli.Progress(command) as progress:
         for path, survey in progress.over(reading.find(paths), "checking recordings"):
             recording = read_recording(reading, path, survey)
             findings = check(recording, others=(), estimator=estimator).findings

@@ -11,7 +11,6 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options, parallel
 from ..cli import option
-from ..parallel import Progress
 
 DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
 
@@ -105,7 +104,7 @@ def _calibrate(args: Namespace) -> int:
         because = "says how well anchors are known, and ground truth is there to tell"
         options.refuse(args, options.OF_TAPE, f"{because}; give --no-truth, too")
     if args.quick:
-        with Progress("calibrate") as progress:
+        with cli.Progress("calibrate") as progress:
             looking = partial(progress, "looking at a part of the flights")
             if all(known):
                 sentences = forecast(flights, base, config, looking).sentences()
@@ -117,7 +116,7 @@ def _calibrate(args: Namespace) -> int:
         flights, holdout = flights[:-1], flights[-1:]
         judges = paths[-1:]
     *_, over = parallel.workers_for(args, len(flights))
-    with Progress("calibrate") as progress:
+    with cli.Progress("calibrate") as progress:
         if all(known):
             made = with_truth(flights, holdout, base, config, progress, over)
         else:

@@ -13,7 +13,6 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
 from ..cli import OutputFile, option
-from ..parallel import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -105,7 +104,7 @@ def _recordings(
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
     found = reading.find(args.flights)
-    with Progress("check", len(found), "flight") as progress:
+    with cli.Progress("check", len(found), "flight") as progress:
         for path, its_survey in found:
             recording = read_recording(reading, path, its_survey)
             cli.say("check", *(f"{path}: {remark}" for remark in recording.remarks))

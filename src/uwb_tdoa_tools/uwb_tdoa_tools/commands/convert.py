@@ -18,7 +18,6 @@ from .. import cli, options
 from ..choices import COLUMNS
 from ..cli import OutputBag, OutputFile, option
 from ..command_lines import tool
-from ..parallel import Progress
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
@@ -118,7 +117,7 @@ def _convert(args: Namespace) -> None:
                 "(--survey FILE)."
             )
         reading = replace(reading, profile=Profile.of_columns(parse_columns(args.columns)))
-    with Progress("convert", what="reading and writing"):
+    with cli.Progress("convert", what="reading and writing"):
         made = convert(
             lambda: on_one_clock(shifted(reading.one(*args.input), offsets), args.align),
             args.out,

@@ -14,7 +14,6 @@ from uwb_tdoa_bias.common.files import write_text
 from .. import cli, command_lines, options, parallel
 from ..choices import DRIFT, NONE, PLAN_SPEED, PLAN_TIME, REFERENCES, TAPE_STD
 from ..cli import exclusive, option
-from ..parallel import Progress
 
 DESCRIPTION = """Find systematic errors in the measurements of some flights, and correct them.
 
@@ -196,7 +195,7 @@ def _diagnose(args: Namespace) -> int:
         if args.plan_flight
         else None
     )
-    with Progress("diagnose") as progress:
+    with cli.Progress("diagnose") as progress:
         result = diagnose(
             flights, holdout, effects or EffectSet(), config, reference, progress, over
         )

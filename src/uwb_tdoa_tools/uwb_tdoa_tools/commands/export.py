@@ -12,7 +12,6 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli
 from ..cli import OutputFileInFolder, OutputFolder, option
-from ..parallel import Progress
 
 
 def parser() -> ArgumentParser:
@@ -106,7 +105,7 @@ def _export(args: Namespace) -> None:
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
     model = load_network(args.model)
     given = anchors, effects, model
-    with Progress("export", what="writing the equations"):
+    with cli.Progress("export", what="writing the equations"):
         traced = write_onnx(args.onnx, *given) if args.onnx else trace(*given)
         if args.c:
             write_c(args.c, traced)

@@ -10,7 +10,6 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options
 from ..cli import OutputBag, option
-from ..parallel import Progress
 
 DESCRIPTION = """Add a declared effect to a flight, and write the flight that would have been recorded with it as a
 ROS 2 bag.
@@ -68,7 +67,7 @@ def _inject(args: Namespace) -> None:
         if not getattr(args, name):
             raise InputError(f"{name}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
-    with Progress("inject", what="reading and writing"):
+    with cli.Progress("inject", what="reading and writing"):
         name = inject(
             effect,
             args.flight,

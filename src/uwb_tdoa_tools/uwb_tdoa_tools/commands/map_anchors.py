@@ -10,7 +10,6 @@ from uwb_tdoa_bias.common.errors import InputError
 
 from .. import choices, cli, command_lines, options
 from ..cli import option
-from ..parallel import Progress
 
 DESCRIPTION = """Make a first map of anchors whose positions are unknown.
 
@@ -82,7 +81,7 @@ def _map_anchors(args: Namespace) -> int:
     _check(args)
     reading = options.reading_of(args, truth=False)
     flights = reading.flights(args.flights)
-    with Progress("map_anchors", what="looking at the measurements") as progress:
+    with cli.Progress("map_anchors", what="looking at the measurements") as progress:
         seen, frame = given(
             flights,
             args.survey,

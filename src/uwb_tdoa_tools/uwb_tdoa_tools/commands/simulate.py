@@ -14,7 +14,6 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from .. import cli
 from ..choices import CARRIERS, PROTOCOLS, STORAGES, TRAJECTORIES, YAW_PROFILES
 from ..cli import OutputBag, OutputFile, exclusive, group, option
-from ..parallel import Progress
 
 if TYPE_CHECKING:
     from ..simulation.config import SimulationConfig
@@ -319,7 +318,7 @@ def _simulate(args: Namespace) -> None:
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     check_image(args.plot)
-    with Progress("simulate", what="flying"):
+    with cli.Progress("simulate", what="flying"):
         flight = simulate(config_of(args))
         content = summary(flight)
     cli.show(
@@ -332,7 +331,7 @@ def _simulate(args: Namespace) -> None:
         f"{content['outliers']} outliers"
     )
     if args.out is not None:
-        with Progress("simulate", what="writing"):
+        with cli.Progress("simulate", what="writing"):
             write_bag(flight, args.out, args.storage, args.force)
         cli.show(f"wrote {args.out}")
     if args.json is not None:

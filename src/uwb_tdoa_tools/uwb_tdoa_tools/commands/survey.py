@@ -7,7 +7,6 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 
 from .. import cli, command_lines, options, parallel
-from ..parallel import Progress
 
 DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
@@ -85,7 +84,7 @@ def _survey(args: Namespace) -> int:
     remarks = remark_on_surveys([its for _, its in reading.find(args.flights)], flights)
     cli.say("survey", *remarks, *judge.remarks(flights[0].anchors))
     known = options.known_of(args, flights)
-    with Progress("survey") as progress:
+    with cli.Progress("survey") as progress:
         result = self_calibrate(
             flights, tape, base, config, known, lambda: progress("solving"), over
         )

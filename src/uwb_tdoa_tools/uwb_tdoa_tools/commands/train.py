@@ -10,7 +10,6 @@ from functools import partial
 from .. import cli, options, parallel
 from ..choices import MODELS
 from ..cli import OutputFolder, option
-from ..parallel import Progress
 
 MOST = 300_000  # TDOAs; what they take: docs/notebook/speed.md
 
@@ -64,7 +63,7 @@ def _train(args: Namespace) -> None:
     from ..readers import inputs
     from ..scoring.evaluation import with_aligned_truth
     from ..scoring.metrics import gain_in_words
-    from ..training import labels as labelling, models
+    from ..training import models
 
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
@@ -73,13 +72,13 @@ def _train(args: Namespace) -> None:
     inputs.require_tdoas(several, "train")
     aligned = parallel.over(partial(with_aligned_truth, align=args.align), several, jobs, dask)
     flights = {flight.name: flight for flight in aligned}
-    names = labelling.split(list(flights), args.seed, args.validation)
+    names = models.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
         cli.show(f"{what:13s} {', '.join(some)}")
     training, validation = ([flights[name] for name in some] for some in names)
     name = args.name or args.model
     recipe = models.Recipe(args.model, args.seed)
-    with Progress("train", what=f"training on {len(training)} flights, then without each"):
+    with cli.Progress("train", what=f"training on {len(training)} flights, then without each"):
         result, shrinkage = models.train_shrunk(
             recipe, training, validation, name, progress=cli.show, map_function=over
         )

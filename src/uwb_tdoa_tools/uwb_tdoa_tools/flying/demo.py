@@ -28,12 +28,11 @@ from uwb_tdoa_ekf.offline import run_offline
 
 from .. import command_lines
 from ..bags.bag import RecordedOdometry, read_odometry, write_bag
-from ..cli import as_json
+from ..cli import Progress, as_json
 from ..diagnosis import diagnose
 from ..diagnosis.report.entries import entries, worth_in_words
 from ..diagnosis.result import Diagnosis
 from ..localizing.pictures import write_rerun
-from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..scoring.metrics import Estimate, Score, change_in_words, position_at
 from ..scoring.pairs import CM, PairResiduals, residuals_of

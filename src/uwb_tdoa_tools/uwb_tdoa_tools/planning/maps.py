@@ -23,15 +23,14 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight
-from uwb_tdoa_bias.common.flyable import FlyableVolume
 
 from .. import parallel
 from ..checking.coverage import sides_of
 from ..choices import ACCURACY
-from ..parallel import Progress
+from ..cli import Progress
 from ..scoring.evaluation import evaluate
 from ..simulation.config import Room, Walls, facing, heard_at
 from .precision import (

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
-from ..parallel import Progress
+from ..cli import Progress
 from ..simulation.config import facing
 from .maps import Chart, Demand, Hall, Judged, Wrap, judge
 from .precision import (

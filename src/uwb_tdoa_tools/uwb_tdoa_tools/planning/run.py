@@ -20,10 +20,9 @@ from uwb_tdoa_bias.common.survey import read_named_anchors
 
 from .. import cli, parallel
 from ..choices import OF_PROTOCOL
-from ..parallel import Progress
 from ..readers.inputs import Reading, Recording
 from ..simulation.config import Room, Walls, room_of
-from . import maps, optimisation, plots, report
+from . import maps, optimisation, report
 from .maps import Chart, Demand, Grid, Hall, design, placements, step_of
 from .optimisation import AnchorPlaces, Goal, lattice
 from .precision import FixedNoise, Installation, RadioNoise, antenna_from_yaml
@@ -72,7 +71,7 @@ def plan(args: Namespace) -> bool:
     if installation.hall:
         figures["side"] = whole.side(grid.points)
         report.print_heard(about)
-        plots.plot_heard(whole.anchors, found, args.out / "heard.png", walls)
+        report.plot_heard(whole.anchors, found, args.out / "heard.png", walls)
     else:
         about |= report.in_hull(found, installation)
         report.print_in_hull(about)
@@ -254,7 +253,7 @@ def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, Chart, lis
 
     It is the layout with the fewest anchors that has the wanted share on all of the Grid.
     """
-    with Progress("plan") as progress:
+    with cli.Progress("plan") as progress:
         layouts, steps = design(whole, grid.points, args.share, progress)
     for anchors in layouts:
         found = whole.with_anchors(anchors).chart(grid, args.jobs, args.dask)
@@ -286,7 +285,7 @@ def advice(args: Namespace, whole: Hall, found: Chart) -> dict[str, Any] | None:
     else:
         places = places_of(args, whole.demand.room)
         tried = np.unique(places.positions(places.grid(PLACES_TRIED)).round(2), axis=0)
-    with Progress("plan") as progress:
+    with cli.Progress("plan") as progress:
         return optimisation.best_addition(whole, found, tried, progress)
 
 
@@ -297,8 +296,8 @@ def draw_map(whole: Hall, found: Chart, out: Path) -> None:
     """
     anchors, installation = whole.anchors, whole.installation
     pairings = installation if whole.demand.criterion == "pairings" else None
-    plots.plot_precision(anchors, found, out / "precision.png", whole.walls)
-    plots.plot_flyable(anchors, found, out / "flyable.png", whole.walls, pairings)
+    report.plot_precision(anchors, found, out / "precision.png", whole.walls)
+    report.plot_flyable(anchors, found, out / "flyable.png", whole.walls, pairings)
     found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
     report.write_messages(report.map_messages(found, anchors), out / "plan_bag")
 
@@ -337,7 +336,7 @@ def evaluate_flights(
     pooled = maps.pooled(samples)
     rows.append({"flight": f"{len(samples)} pooled", **maps.comparison(pooled, installation)})
     found = maps.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
-    plots.plot_accuracy(installation, found, out / "accuracy.png")
+    report.plot_accuracy(installation, found, out / "accuracy.png")
     return rows
 
 
@@ -355,7 +354,7 @@ def improve(
     before : Chart with the anchors as they are; goal, reported, places, count : of `aim_of`.
     """
     installation, anchors = goal.installation, goal.installation.anchors
-    with Progress("plan") as progress:
+    with cli.Progress("plan") as progress:
         start = anchors.positions if count == len(anchors) else None
         over = partial(progress.over, what="layouts")
         found = optimisation.optimise(goal, places, count, start, starts, over)
@@ -363,7 +362,7 @@ def improve(
         better.to_yaml(out / "improved.yaml")
         after = Hall(replace(installation, anchors=better), goal.demand)
         charted = after.chart(before.grid)
-        plots.plot_layouts(
+        report.plot_layouts(
             [("before", installation, before), ("after", after.installation, charted)],
             goal.points,
             out / "layout.png",
