@@ -298,7 +298,7 @@ def test_tdoas_of_which_none_is_used_are_named_within_two_seconds(reason, words)
     assert not any(said for _, said in looked.go(10.0, used=1.0))
     at, said = looked.first(3.0, **{reason: 1.0})
     assert at <= 2.0 and words in said
-    assert looked.use.tdoa_age >= 0.9 and looked.use.arrival_age < 0.3
+    assert looked.use.age("tdoa") >= 0.9 and looked.use.age("arrival") < 0.3
     assert looked.go(4.5, used=1.0)[-1][1] is None
 
 
@@ -322,12 +322,12 @@ def test_most_that_contradict_for_long_are_named():
 
 def test_silence_has_an_age():
     looked = Looked()
-    assert looked.use.tdoa_age == looked.use.imu_age == float("inf")
+    assert looked.use.age("tdoa") == looked.use.age("imu") == float("inf")
     looked.go(2.0, used=1.0)
     looked.go(3.0, rate=0, imu=0)
     assert (
-        looked.use.tdoa_age == pytest.approx(3.0) == looked.use.imu_age
-        and not looked.use.imu_used
+        looked.use.age("tdoa") == pytest.approx(3.0) == looked.use.age("imu")
+        and not looked.use.lately("imu")
         and looked.use.why_unused is None
     )
 

@@ -523,7 +523,9 @@ class EkfNode(StreamNode):
         self._health.look(self._estimator, self._counts())
         status, yaw_std = self._judge(), self._yaw_std()
         stamp = self.outputs.stamp if self.outputs.published else self.get_clock().now().to_msg()
-        self._status.publish(status, yaw_std, self._health.use.tdoa_age, stamp, self.outputs.world)
+        self._status.publish(
+            status, yaw_std, self._health.use.age("tdoa"), stamp, self.outputs.world
+        )
 
     def _judge(self) -> Status:
         """Return the current Status: whether a vehicle may fly by the odometry.

@@ -7,33 +7,19 @@ They take long to import, and nodes rarely need them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import ModuleType
+from importlib import import_module
 from typing import Any
 
 
 class LazyModule:
     """A stand-in for a module that is imported when an attribute is used."""
 
-    def __init__(self, load: Callable[[], ModuleType]) -> None:
-        """Set `load`, a function that imports and returns the module."""
-        self._load = load
+    def __init__(self, name: str) -> None:
+        self._name = name
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._load(), name)
+        return getattr(import_module(self._name), name)
 
 
-@LazyModule
-def interpolate() -> ModuleType:
-    """Import scipy.interpolate."""
-    from scipy import interpolate as module
-
-    return module
-
-
-@LazyModule
-def rotations() -> ModuleType:
-    """Import scipy.spatial.transform."""
-    from scipy.spatial import transform as module
-
-    return module
+interpolate = LazyModule("scipy.interpolate")
+rotations = LazyModule("scipy.spatial.transform")

@@ -489,7 +489,7 @@ class AnchorIds(LabelEffect):
         self, a: np.ndarray, b: np.ndarray, d: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         table = {int(key): int(value) for key, value in self.values.items()}
-        return _replaced(a, table), _replaced(b, table), d
+        return replaced(a, table), replaced(b, table), d
 
     def mislabelled(
         self, a: np.ndarray, b: np.ndarray, d: np.ndarray
@@ -507,7 +507,7 @@ class AnchorIds(LabelEffect):
         return (f"Give the anchors their ids again, or list them so in the survey: {wrong}.",)
 
 
-def _replaced(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
+def replaced(ids: np.ndarray, table: dict[int, int]) -> np.ndarray:
     """Return ids (n,), each replaced by its entry in the table, all at once."""
     ids = np.asarray(ids)
     return np.array([table.get(one, one) for one in ids.tolist()], dtype=ids.dtype)

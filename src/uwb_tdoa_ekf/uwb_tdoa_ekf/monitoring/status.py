@@ -40,15 +40,7 @@ USED = (
 
 
 class Use:
-    """Track which measurements the filter uses; `update` is called several times per second.
-
-    Attributes
-    ----------
-    tdoa_age, imu_age : float
-        Time since a TDOA or distance, or an inertial sample, was used, in s; inf before the first.
-    arrival_age : float
-        Time since a TDOA or distance arrived, in s.
-    """
+    """Track which measurements the filter uses; `update` is called several times per second."""
 
     def __init__(self, lag: float) -> None:
         """Store the time `lag`, in s, for which the filter waits for a silent stream."""
@@ -101,30 +93,19 @@ class Use:
         while len(self._looks) > 2 and self._looks[1][0] <= now - WINDOW_OF_REJECTED:
             self._looks.popleft()
 
-    def _age(self, kind: str) -> float:
+    def age(self, kind: str) -> float:
+        """Return the time since a message of a kind was used, or arrived, in s; inf before the first.
+
+        Parameters
+        ----------
+        kind : str
+            "tdoa" (TDOAs and distances), "imu", "velocity"; or "arrival" of TDOAs and distances.
+        """
         return self._now - self._since[kind] if kind in self._since else math.inf
 
-    @property
-    def tdoa_age(self) -> float:
-        return self._age("tdoa")
-
-    @property
-    def arrival_age(self) -> float:
-        return self._age("arrival")
-
-    @property
-    def imu_age(self) -> float:
-        return self._age("imu")
-
-    @property
-    def imu_used(self) -> bool:
-        """Return whether inertial samples were used lately."""
-        return self.imu_age < SILENT
-
-    @property
-    def velocity_used(self) -> bool:
-        """Return whether velocities were used lately."""
-        return self._age("velocity") < SILENT
+    def lately(self, kind: str) -> bool:
+        """Return whether a message of a kind was used lately."""
+        return self.age(kind) < SILENT
 
     def _shares(self, window: float) -> dict[str, float]:
         """Return {result: share of the TDOAs, 0 to 1} over the last `window` s; {} for too few."""
@@ -150,7 +131,7 @@ class Use:
         for name in ("late", "invalid"):
             if shares.get(name, 0.0) > LARGEST_UNUSED:
                 return self._sentence(name)
-        none_used = self.tdoa_age > SILENT and shares.get("rejected", 0.0) > LARGEST_UNUSED
+        none_used = self.age("tdoa") > SILENT and shares.get("rejected", 0.0) > LARGEST_UNUSED
         return self._sentence("rejected") if none_used or self.contradicted else None
 
     def _sentence(self, reason: str) -> str:
@@ -255,7 +236,7 @@ def fault_of(findings: Sequence[Finding], use: Use, left_out: Finding | None) ->
     left_out : Finding or None
         Reason why the filter ignores the IMU.
     """
-    imu_used = use.imu_used and left_out is None
+    imu_used = use.lately("imu") and left_out is None
     return next((finding for finding in findings if finding.position_wrong(imu_used)), None)
 
 
@@ -298,7 +279,7 @@ def status_of(
     if not estimator.running:
         if fault is not None:
             return Status(FAULT, False, fault.sentence)
-        if use.arrival_age > SILENT:
+        if use.age("arrival") > SILENT:
             return Status(WAITING, False, "there are no TDOAs: see /diagnostics")
         restarted = estimator.restarted
         return Status(
@@ -324,11 +305,11 @@ def _reason_against_flying(
     imu_fault = estimator.without_imu  # Finding for which the IMU is left out, or None
     if estimator.unsure:
         return estimator.unsure
-    if use.tdoa_age > SILENT:
+    if use.age("tdoa") > SILENT:
         trouble = use.why_unused or f"no TDOA was used for more than {SILENT:g} s"
         sources = [
-            *(["the IMU"] if use.imu_used and imu_fault is None else []),
-            *(["the velocities"] if use.velocity_used else []),
+            *(["the IMU"] if use.lately("imu") and imu_fault is None else []),
+            *(["the velocities"] if use.lately("velocity") else []),
         ]
         motion = (
             f"by {' and '.join(sources)} alone"
@@ -347,7 +328,7 @@ def _reason_against_flying(
             "the yaw was wrong, and is looked for again: do not steer by it; it is known once the "
             "tag has moved"
         )
-    if not yaw_known and not (use.imu_used or use.velocity_used):
+    if not yaw_known and not (use.lately("imu") or use.lately("velocity")):
         return (
             "the yaw is not known, because neither an IMU nor velocities are used: do not steer "
             "by it; give imu/data, or odometry of wheels"

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_bias.common.arrays import Stamped
@@ -149,19 +150,13 @@ def _slowly_left(values: np.ndarray, block: np.ndarray) -> np.ndarray:
     )
 
 
-def _integral(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the integral of samples (m, 3) over t (m,), (m, 3)."""
-    steps = 0.5 * (values[1:] + values[:-1]) * np.diff(t)[:, None]
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-
-
 def _at(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(when, t, column) for column in values.T], axis=1)
 
 
 def _mean(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
     """Return means (n, 3) over HALF to both sides."""
-    total = _integral(t, values)
+    total = cumulative_trapezoid(values, t, axis=0, initial=0.0)
     return (_at(t, total, when + HALF) - _at(t, total, when - HALF)) / (2.0 * HALF)
 
 
@@ -170,7 +165,9 @@ def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray
 
     A second difference of positions has the same weight.
     """
-    total = _integral(t, _integral(t, values - values.mean(axis=0)))
+    total = values - values.mean(axis=0)
+    for _ in range(2):
+        total = cumulative_trapezoid(total, t, axis=0, initial=0.0)
     second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
     return second / HALF**2 + values.mean(axis=0)
 

@@ -16,6 +16,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import UNITS as SURVEY_UNITS, Anchors
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
+from uwb_tdoa_bias.effects.anchor import replaced
 from uwb_tdoa_ekf.monitoring.explain import SCALE, compare
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.monitoring.judge import Judge, exchanged, wrong_scale, wrong_sign
@@ -426,9 +427,5 @@ def best_trial(
 
 def relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:
     """Return the recording with ids replaced by the dict `table`, all at once."""
-    columns = {}
-    for name, ids in (("a", recording.tdoa.a), ("b", recording.tdoa.b)):
-        columns[name] = ids.copy()
-        for one, two in table.items():
-            columns[name][ids == one] = two
-    return recording.with_tdoa(**columns)
+    a, b = (replaced(ids, table) for ids in (recording.tdoa.a, recording.tdoa.b))
+    return recording.with_tdoa(a=a, b=b)

@@ -79,10 +79,9 @@ def verdict_of(flown: TrialResult) -> dict[str, Any]:
 
 def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, Any]:
     """Return the figures of one Mission until `end`, s."""
-    assert flown.flight.truth is not None
-    times = flown.flight.truth.t
+    times = flown.flight.known_truth.t
     inside = slice(*np.searchsorted(times, (mission.begin, end)))
-    truth = rows_of(flown.flight.truth, inside)
+    truth = rows_of(flown.flight.known_truth, inside)
     states, contact = flown.states[inside], flown.contact[inside]
     mine = slice(*np.searchsorted(flown.odometry.t, (mission.begin, end)))
     odometry = sampled(rows_of(flown.odometry, mine), SPACING)
@@ -139,8 +138,8 @@ def _touchdown(states: np.ndarray, contact: np.ndarray) -> float | None:
 
 def _of_drive(flown: TrialResult) -> dict[str, Any]:
     """Return the verdict of a rover."""
-    mission, truth = flown.missions[-1], flown.flight.truth
-    assert isinstance(mission, Drive) and truth is not None
+    mission, truth = flown.missions[-1], flown.flight.known_truth
+    assert isinstance(mission, Drive)
     end = float(truth.t[-1])
     started, ended = mission.started or end, mission.ended or end
     way = truth.p[(truth.t >= started) & (truth.t <= ended)][::8, :2]
@@ -189,8 +188,7 @@ def _common(flown: TrialResult, mission: Journey, end: float) -> dict[str, Any]:
     }
     if mission.started is None:
         return figures
-    odometry, truth = flown.odometry, flown.flight.truth
-    assert truth is not None
+    odometry, truth = flown.odometry, flown.flight.known_truth
     k = int(np.searchsorted(odometry.t, mission.started, side="right")) - 1
     error = odometry.p[k] - position_at(odometry.t[k : k + 1], truth)[0]
     deviations = float(np.max(np.abs(error) / np.sqrt(np.diag(odometry.covariance[k])[:3])))
@@ -444,8 +442,7 @@ class DrawnFlight:
 
 def drawn_flight(result: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
     """Return the figures of a TrialResult to draw."""
-    assert result.flight.truth is not None
-    truth, odometry = result.flight.truth, sampled(result.odometry, DRAWN)
+    truth, odometry = result.flight.known_truth, sampled(result.odometry, DRAWN)
     every = max(1, round(DRAWN / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
     wanted = np.full(p.shape, np.nan)

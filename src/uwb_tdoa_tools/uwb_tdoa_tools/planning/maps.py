@@ -105,6 +105,12 @@ class Judged:
         self.status[rows] = found.status
 
 
+def unheard(points: np.ndarray, k: int) -> Judged:
+    """Return the Judged, in k dimensions, of points (n, 3) m that hear too few anchors."""
+    n = len(points)
+    return Judged(np.full((n, k, k), np.inf), np.full(n, np.inf), np.full(n, TOO_FEW))
+
+
 def judge(
     points: np.ndarray,
     installation: Installation,
@@ -116,9 +122,8 @@ def judge(
     columns : (n, K) rows of the anchors that are heard at each point, in order; None for all.
     """
     heard = len(installation.anchors) if columns is None else columns.shape[1]
-    n, k = len(points), installation.dimensions
     if heard <= installation.unknowns:
-        return Judged(np.full((n, k, k), np.inf), np.full(n, np.inf), np.full(n, TOO_FEW))
+        return unheard(points, installation.dimensions)
     covariance = bound(information(points, installation, not demand.quick, columns))
     error = position_error(covariance)
     status = np.where(error <= demand.accuracy, FLYABLE, IMPRECISE)
@@ -367,7 +372,7 @@ class Hall:
         tiles = self._tiles(points)
         unit = "part of the hall" if len(tiles) > 1 else "map"
         parts = [points[cells] for cells in tiles]
-        whole = self.unheard(points)
+        whole = unheard(points, self.installation.dimensions)
         heard = np.zeros(len(points), int)
         results = parallel.over(self.judge, parts, jobs, dask, unit)
         for cells, (found, counts) in zip(tiles, results):
@@ -386,7 +391,7 @@ class Hall:
             return found, np.full(len(points), len(self.anchors))
         heard = self.heard(points)
         counts = np.array([len(rows) for rows in heard], int)
-        whole = self.unheard(points)
+        whole = unheard(points, self.installation.dimensions)
         heard_somewhere = np.unique(np.concatenate([np.empty(0, int), *heard]))
         # Points with the same number of anchors are judged at once.
         for count in np.unique(counts[counts > self.installation.unknowns]):
@@ -410,11 +415,6 @@ class Hall:
         order = np.argsort(tile.ravel(), kind="stable")
         return np.split(order, np.flatnonzero(np.diff(tile.ravel()[order])) + 1)
 
-    def unheard(self, points: np.ndarray) -> Judged:
-        """Return the Judged of points (n, 3) m that hear no anchor."""
-        n, k = len(points), self.installation.dimensions
-        return Judged(np.full((n, k, k), np.inf), np.full(n, np.inf), np.full(n, TOO_FEW))
-
     def with_anchors(self, anchors: Anchors) -> Hall:
         """Return the same Hall with other Anchors."""
         return replace(self, installation=self.installation.with_anchors(anchors))
@@ -435,7 +435,12 @@ class Hall:
 
     def everywhere(self, points: np.ndarray) -> Judged:
         """Return the Judged of points (n, 3) m all over a hall."""
-        return self.changed(self.unheard(points), points, self.anchors, self.anchors.positions)
+        return self.changed(
+            unheard(points, self.installation.dimensions),
+            points,
+            self.anchors,
+            self.anchors.positions,
+        )
 
     def side(self, points: np.ndarray) -> dict[str, Any] | None:
         """Return where the heard anchors lie in a plane: {"share": of points, "tag_side": values}.

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -256,16 +255,6 @@ class ExactMotion:
     q: np.ndarray
     body_rates: np.ndarray
     specific_force: np.ndarray
-
-
-class Flyable(Protocol):
-    """A vehicle that `simulate` moves."""
-
-    def motion(self, t: np.ndarray) -> ExactMotion:
-        """Return the ExactMotion at stamps t, (n,) s."""
-
-    def motors(self, t: np.ndarray) -> np.ndarray:
-        """Return whether the motors run at stamps t: (n,) bool."""
 
 
 class Trajectory:
@@ -565,6 +554,7 @@ def _check_time(config: Complete) -> None:
         )
 
 
+Flyable = Trajectory | Rover | HandHeld  # what `simulate` moves
 VEHICLES: dict[str, Callable[[Complete, Room, np.random.Generator], Flyable]] = {
     "quadrotor": Trajectory.of_config,
     "rover": Rover,
