@@ -9,8 +9,8 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.core.memory import USED
+from uwb_tdoa_ekf.monitoring.anchor_watch import LENGTH
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
-from uwb_tdoa_ekf.monitoring.slices import LENGTH
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
 RATE = 400  # Hz, rate of TDOAs

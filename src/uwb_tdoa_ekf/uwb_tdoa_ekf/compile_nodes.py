@@ -28,9 +28,8 @@ from uwb_tdoa_bias.effects.samples import ImuFeatures
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
-from .monitoring.change import YOUNGEST, ChangeDetector
+from .monitoring.anchor_watch import LENGTH, YOUNGEST, ChangeDetector, Slice
 from .monitoring.judge import Judge
-from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_rules import StreamWatch
 from .results import pose_and_twist, rotation_std
 

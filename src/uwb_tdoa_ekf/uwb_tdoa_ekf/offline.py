@@ -39,8 +39,8 @@ from .core.memory import (
     usable_tdoas,
 )
 from .core.sensors import STREAMS
+from .monitoring.anchor_watch import LENGTH
 from .monitoring.monitor import Monitor
-from .monitoring.slices import LENGTH
 from .reorder_buffer import FIRST_SENSOR, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, poses_of
 

@@ -25,9 +25,9 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 
 from ..core.ground import solve
+from .anchor_watch import Piece, best_order
 from .explain import SCALE, compare_losses, in_words
 from .finding import ERROR, Finding
-from .swap import Piece, best_order
 
 # most pairs of a snapshot; fewest anchors: three coordinates and a scale need four differences
 PAIRS, HEARD = (32, 5)

@@ -29,13 +29,24 @@ from ..anchor_table import AnchorTable
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
-from .change import Change, ChangeDetector
+from .anchor_watch import (
+    LENGTH,
+    Change,
+    ChangeDetector,
+    Displaced,
+    Order,
+    Piece,
+    Slice,
+    SurveyComparison,
+    clear_order,
+    reduced,
+    residuals as residuals_of,
+    suspects,
+    turned,
+)
 from .finding import WARNING, Finding
 from .inertial_rules import AXES
 from .judge import exchanged
-from .reference import Displaced, SurveyComparison
-from .slices import LENGTH, Slice, reduced, turned
-from .swap import Order, Piece, clear_order, residuals as residuals_of, suspects
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
