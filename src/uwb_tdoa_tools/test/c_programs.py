@@ -18,7 +18,7 @@ from uwb_tdoa_bias.correction.model import FEATURES
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, Samples, SmoothTerm
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_tools.exporting.c_code import MEMBERS, Dense
-from uwb_tdoa_tools.exporting.expressions import ELEMENTWISE
+from uwb_tdoa_tools.exporting.tracing import ELEMENTWISE
 from uwb_tdoa_tools.training.models import WITHOUT
 
 HERE = Path(__file__).parent / "cortex_m"

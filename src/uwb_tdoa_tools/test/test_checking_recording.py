@@ -19,7 +19,7 @@ from uwb_tdoa_tools.checking import coverage, recording_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight, read_recording
 from uwb_tdoa_tools.checking.recording_rules import RULES
-from uwb_tdoa_tools.checking.sensor_rules import tag_delay
+from uwb_tdoa_tools.checking.watch import tag_delay
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.live.session import End
 from uwb_tdoa_tools.readers.inputs import Reading

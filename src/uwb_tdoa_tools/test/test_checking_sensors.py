@@ -10,7 +10,7 @@ import pytest
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.sensor_rules import OF_SENSORS, judge_sensors
+from uwb_tdoa_tools.checking.watch import OF_SENSORS, judge_sensors
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import DOUBTFUL, GOOD, assess
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

@@ -41,9 +41,8 @@ from . import coverage, imu_rules, motion_rules, pair_rules, recording_rules, td
 from .ordered import OrderedRecording, SurveyFit, differences, displacement
 from .pair_rules import MANY, KnownPath, least_height, repairs_of
 from .recording import Recording, of_flight, read_recording
-from .sensor_rules import judge_sensors
 from .tdoa_rules import SAME, gained, largest_displacement
-from .watch import BEFORE_TRUTH, EXCHANGED, FIRST, found_by_monitor, together
+from .watch import BEFORE_TRUTH, EXCHANGED, FIRST, found_by_monitor, judge_sensors, together
 
 if TYPE_CHECKING:
     from ..live.session import End

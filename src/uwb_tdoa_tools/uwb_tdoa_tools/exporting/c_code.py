@@ -27,8 +27,16 @@ from uwb_tdoa_bias.correction.model import Network
 from uwb_tdoa_bias.effects import EffectSet
 
 from . import crazyflie
-from .expressions import Pieces, Program, Scalar
-from .tracing import LeftOut, TracedCorrection, expressions_of, left_out, samples_of
+from .tracing import (
+    LeftOut,
+    Pieces,
+    Program,
+    Scalar,
+    TracedCorrection,
+    expressions_of,
+    left_out,
+    samples_of,
+)
 
 OPERATORS = {
     "neg": "-{}",

@@ -30,8 +30,7 @@ from uwb_tdoa_bias.correction.model import INPUTS, OUTPUTS, Model
 from uwb_tdoa_bias.correction.trial import Unplayable, tried_out
 from uwb_tdoa_bias.effects import EffectSet
 
-from .expressions import Pieces, Program, Scalar
-from .tracing import TracedCorrection, trace
+from .tracing import Pieces, Program, Scalar, TracedCorrection, trace
 
 # `trial.py` lists the operators of these versions
 OPSET, LAST_OPSET, IR_VERSION = 13, 17, 8

@@ -27,8 +27,7 @@ from .. import command_lines
 from ..bags.bag import write_odometry
 from ..checking.check import check
 from ..checking.recording import of_flight
-from ..checking.sensor_rules import OF_SENSORS
-from ..checking.watch import OF_ANCHORS
+from ..checking.watch import OF_ANCHORS, OF_SENSORS
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..scoring.metrics import LOST, has_innovation, nis, radio_residuals
