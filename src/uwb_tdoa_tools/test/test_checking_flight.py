@@ -19,8 +19,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet, true_samples
 from uwb_tdoa_tools.checking import motion_rules, pair_rules
 from uwb_tdoa_tools.checking.check import judge_against_truth, judge_flight, judge_truth
 from uwb_tdoa_tools.checking.motion_rules import TrueMotion, judge_imu, truth_unit
-from uwb_tdoa_tools.checking.pair_rules import KnownPath, repairs
-from uwb_tdoa_tools.checking.time_rules import delays, wrong_stamps
+from uwb_tdoa_tools.checking.pair_rules import KnownPath, delays, repairs, wrong_stamps
 from uwb_tdoa_tools.scoring.evaluation import require_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -9,12 +9,11 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_tools.checking import pair_rules, tdoa_rules, time_rules
+from uwb_tdoa_tools.checking import pair_rules, tdoa_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.ordered import SHORT, OrderedRecording
-from uwb_tdoa_tools.checking.pair_rules import MANY, KnownPath
+from uwb_tdoa_tools.checking.pair_rules import DRIFTS, JUMPS, MANY, OF_ALL, KnownPath
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.time_rules import DRIFTS, JUMPS, OF_ALL
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
@@ -188,8 +187,10 @@ def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(soun
 
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late, monkeypatch):
-    monkeypatch.setattr(time_rules, "MOST", len(sound.tdoa) // 20)  # as in a recording of an hour
-    of = time_rules.delays_of_tdoas(
+    monkeypatch.setattr(
+        pair_rules, "MOST_TDOAS", len(sound.tdoa) // 20
+    )  # as in a recording of an hour
+    of = pair_rules.delays_of_tdoas(
         KnownPath(replace(sound, tdoa=replace(sound.tdoa, t=sound.tdoa.t + late)))
     )
     ratio, delay = of.constant()

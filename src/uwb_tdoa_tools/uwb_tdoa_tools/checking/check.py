@@ -37,7 +37,7 @@ from .. import cli, command_lines
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..readers.streams import protocol
-from . import coverage, imu_rules, motion_rules, pair_rules, recording_rules, tdoa_rules, time_rules
+from . import coverage, imu_rules, motion_rules, pair_rules, recording_rules, tdoa_rules
 from .ordered import OrderedRecording, SurveyFit, differences, displacement
 from .pair_rules import MANY, KnownPath, least_height, repairs_of
 from .recording import Recording, of_flight, read_recording
@@ -459,7 +459,7 @@ def _of_tdoas(path: KnownPath) -> list[Finding]:
         found += pair_rules.exchanged_ids(path)
     found += pair_rules.wrong_values(path.without(repairs[0]) if found else path)
     if not any(finding.rule.startswith(("ids", "tdoa")) for finding in found):
-        found += time_rules.wrong_stamps(path)
+        found += pair_rules.wrong_stamps(path)
     return found
 
 

@@ -20,8 +20,8 @@ from uwb_tdoa_bias.common.geometry import tdoa as predicted_tdoa
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
+from .pair_rules import BLOCK, LONGEST, Delays, delays, drift_or_jump
 from .recording import Recording
-from .time_rules import BLOCK, LONGEST, Delays, delays, drift_or_jump
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell is averaged
 BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays

@@ -31,8 +31,7 @@ from uwb_tdoa_ekf.offline import Run
 
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion, truth_unit
-from ..checking.pair_rules import KnownPath, repairs
-from ..checking.time_rules import Delays, delays_of_tdoas
+from ..checking.pair_rules import Delays, KnownPath, delays_of_tdoas, repairs
 from ..choices import FRAME, NONE, TIME
 from ..clock import grid
 from ..estimate import FlightEstimator
