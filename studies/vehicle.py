@@ -18,8 +18,7 @@ from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.cli import OutputFolder
-from uwb_tdoa_tools.exporting.c_code import write_crazyflie
-from uwb_tdoa_tools.exporting.crazyflie import comparison, stddev_of
+from uwb_tdoa_tools.exporting.c_code import comparison, stddev_of, write_crazyflie
 from uwb_tdoa_tools.exporting.tracing import trace
 from uwb_tdoa_tools.main import main
 from uwb_tdoa_tools.readers import inputs

@@ -13,7 +13,7 @@ from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_bias.common.lazy import rotations
+from uwb_tdoa_bias.common.arrays import rotations
 from uwb_tdoa_bias.common.transforms import Frames
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS, TF_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.exporting import crazyflie
+from uwb_tdoa_tools.exporting import c_code
 from uwb_tdoa_tools.exporting.c_code import vehicle_code, write_crazyflie
 from uwb_tdoa_tools.exporting.tracing import trace
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -136,7 +136,7 @@ def extra_flags(makefile, folder):
 
 def build(folder, names, stddev):
     """Compile the build with the stand-ins in a folder, and return the program."""
-    made = crazyflie.files(vehicle_code(ANCHORS, chosen(*names)).files, ANCHORS, stddev)
+    made = c_code.firmware_files(vehicle_code(ANCHORS, chosen(*names)).files, ANCHORS, stddev)
     made |= {f"firmware/{name}": text for name, text in FIRMWARE.items()}
     made |= {"firmware/src/updates.c": UPDATES, "firmware/src/estimator_kalman.c": ESTIMATOR}
     for name, text in made.items():
@@ -189,7 +189,7 @@ def test_what_the_filter_does_not_estimate_is_refused_by_the_compiler(tmp_path):
 
 
 def test_the_client_gets_the_anchors_of_the_correction():
-    content = yaml.safe_load(crazyflie.client_yaml(ANCHORS))
+    content = yaml.safe_load(c_code.client_yaml(ANCHORS))
     assert list(content) == ANCHORS.ids.tolist()
     for i, position in zip(ANCHORS.ids, ANCHORS.positions):
         assert [content[i][axis] for axis in "xyz"] == position.tolist()
@@ -270,12 +270,12 @@ def test_flights_are_played_to_the_filter_of_a_checkout(tmp_path):
     config = FilterConfig(tdoa_std=0.25)
     flight = simulate(SimulationConfig(seed=1, duration=16.0))
     held = EffectSet((EFFECTS["anchor_delay"]({"1": 0.3}), EFFECTS["noise_level"]({"0-1": 0.3})))
-    write_crazyflie(build, trace(flight.anchors, held), crazyflie.stddev_of(config))
+    write_crazyflie(build, trace(flight.anchors, held), c_code.stddev_of(config))
     for name, text in CHECKOUT.items():
         (firmware / "src" / name).parent.mkdir(parents=True, exist_ok=True)
         (firmware / "src" / name).write_text(text)
     folder.mkdir()
-    made = crazyflie.FirmwareFilter(build, firmware, folder)
+    made = c_code.FirmwareFilter(build, firmware, folder)
     t, raw = made.estimate(flight, False, False, 0.15)
     tdoa = flight.tdoa
     rows = np.searchsorted(tdoa.t, t)
@@ -295,16 +295,16 @@ def test_flights_are_played_to_the_filter_of_a_checkout(tmp_path):
 
 def test_what_cannot_be_compiled_or_played_is_named(tmp_path):
     with pytest.raises(InputError, match="none cannot be compiled .* give a checkout"):
-        crazyflie.FirmwareFilter(tmp_path, tmp_path / "none", tmp_path)
+        c_code.FirmwareFilter(tmp_path, tmp_path / "none", tmp_path)
     flight = simulate(SimulationConfig(seed=1, duration=16.0))
     with pytest.raises(InputError, match="has no inertial samples"):
-        crazyflie.events_of(flight.without("imu"))
+        c_code.events_of(flight.without("imu"))
 
 
 def test_a_correction_that_makes_a_filter_worse_is_named():
     better, worse = np.array([[0.4, 0.3, 0.2], [0.4, 0.3, 0.32]]), np.array([[0.4, 0.3, 0.34]])
     errors = {"standard": better, "robust": worse, "lost": np.array([[np.nan, 0.3, np.nan]])}
-    text = crazyflie.in_words(errors, ["one", "two"], 0.5)
+    text = c_code.in_words(errors, ["one", "two"], 0.5)
     assert "standard filter worse" not in text and "robust filter worse" in text
     assert "lost filter worse: fly it with uwbBias.enable 0 and tdoa2.stddev 0.500." in text
     assert "0.260" in text  # the mean with the build

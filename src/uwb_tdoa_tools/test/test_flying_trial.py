@@ -15,9 +15,8 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.sensors.pressure import SITE
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.flying.controller import integrate
 from uwb_tdoa_tools.flying.mission import DONE, FLYING, HEIGHT, LOST, RISE, Circles, Rules
-from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, Transport, integrate
 from uwb_tdoa_tools.flying.trial import OwnFilter, Task, Trial, fly
 from uwb_tdoa_tools.flying.vehicle import (
     ATTITUDE,

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.controller import Controller
 from uwb_tdoa_tools.flying.mission import (
     DESCENT_LEAD,
     DONE,
@@ -20,7 +19,7 @@ from uwb_tdoa_tools.flying.mission import (
     Mission,
     Rules,
 )
-from uwb_tdoa_tools.flying.simulator import IMU_RATE, interval
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, Controller, interval
 from uwb_tdoa_tools.flying.vehicle import (
     ATTITUDE,
     GRAVITY,

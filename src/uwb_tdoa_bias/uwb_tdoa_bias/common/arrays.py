@@ -5,13 +5,15 @@
 An effect states its equation once, for arrays of numbers. `export` calls the same code with
 symbolic arrays, and records the equation. numpy's functions take both kinds by themselves. The
 functions below do so where numpy's do not: for conversions, compiled functions, and functions that
-are polynomials between given places. All tables of measurements are Stamped.
+are polynomials between given places. All tables of measurements are Stamped. Parts of scipy that
+take long to import, and that nodes rarely need, are imported at their first use.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -75,3 +77,17 @@ def piecewise(
     if isinstance(x, SymbolicArray):
         return x.piecewise(function, breaks, degree)
     return function(x)
+
+
+class LazyModule:
+    """A stand-in for a module that is imported when an attribute is used."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._name), name)
+
+
+interpolate = LazyModule("scipy.interpolate")
+rotations = LazyModule("scipy.spatial.transform")

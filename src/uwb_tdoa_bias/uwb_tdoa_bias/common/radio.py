@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import floats, piecewise
+from .arrays import floats, interpolate, piecewise
 from .errors import InputError
-from .lazy import interpolate
 
 # Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These
 # are not measured values. Their shape follows the plots in the DWM1000 data sheet, an uneven

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .anchors import FARTHEST, GEODETIC, UNITS, Anchors, refuse_faulty
+from .arrays import rotations
 from .errors import SURVEY_BYTES, InputError
 from .files import read_bytes
-from .lazy import rotations
 from .safe_yaml import parse_yaml
 
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
+from .arrays import rotations
 from .errors import InputError
-from .lazy import rotations
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from ..common.anchors import Anchors
+from ..common.arrays import rotations
 from ..common.geometry import ranges
-from ..common.lazy import rotations
 from .base import (
     ANCHOR,
     OF_ANCHOR,

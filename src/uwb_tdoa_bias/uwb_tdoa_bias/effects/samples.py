@@ -16,12 +16,11 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 
 from ..common.anchors import Anchors
-from ..common.arrays import Stamped, filled, floats
+from ..common.arrays import Stamped, filled, floats, rotations
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.flight import Flight
 from ..common.geometry import ranges, tdoa_each
-from ..common.lazy import rotations
 from ..common.radio import into_frame
 from ..common.sensors import COMPARED
 from ..common.vibration import VIBRATION_CORNER, low_pass, track_vibration

@@ -14,8 +14,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..common.arrays import rotations
 from ..common.flight import Flight
-from ..common.lazy import rotations
 from ..common.sensors import DIAGNOSED, with_measured
 from .base import (
     IDENTITY,

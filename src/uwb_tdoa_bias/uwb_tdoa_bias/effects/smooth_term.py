@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.anchors import Anchors
-from ..common.arrays import floats, piecewise
+from ..common.arrays import floats, interpolate, piecewise
 from ..common.errors import InputError
-from ..common.lazy import interpolate
 from ..common.sensors import BY_POSE, COMPARED
 from .base import (
     Effect,

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from uwb_tdoa_bias.common.lazy import rotations
+from uwb_tdoa_bias.common.arrays import rotations
 
 from ..core.imu_fault_detector import AXIS, FASTEST, UPRIGHT
 from ..core.state import GRAVITY

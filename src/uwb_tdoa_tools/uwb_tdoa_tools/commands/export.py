@@ -90,8 +90,7 @@ def _export(args: Namespace) -> None:
         raise InputError("--onnx, --c, --crazyflie: all are missing; name what to write.")
     from uwb_tdoa_ekf.core.config import FilterConfig
 
-    from ..exporting import crazyflie
-    from ..exporting.c_code import write_c, write_crazyflie
+    from ..exporting import c_code
     from ..exporting.onnx_file import write_onnx  # imports onnx
     from ..exporting.tracing import trace
     from ..readers.inputs import Reading
@@ -99,7 +98,7 @@ def _export(args: Namespace) -> None:
     if bool(args.firmware) != bool(args.flights):
         raise InputError("--firmware and --flights: one needs the other; give both.")
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
-    stddev = crazyflie.stddev_of(config)
+    stddev = c_code.stddev_of(config)
     say = partial(cli.say, "export")
     anchors = read_named_anchors(args.survey).anchors
     effects = EffectSet.from_yaml(args.effects) if args.effects else None
@@ -108,8 +107,8 @@ def _export(args: Namespace) -> None:
     with cli.Progress("export", what="writing the equations"):
         traced = write_onnx(args.onnx, *given) if args.onnx else trace(*given)
         if args.c:
-            write_c(args.c, traced)
-        not_flown = write_crazyflie(args.crazyflie, traced, stddev) if args.crazyflie else ()
+            c_code.write_c(args.c, traced)
+        not_flown = c_code.write_crazyflie(args.crazyflie, traced, stddev) if args.crazyflie else ()
     say(*orientation_remarks(*given), *traced.left_out)
     say(*(f"{args.crazyflie}: {omitted}" for omitted in not_flown))
     name = traced.meta()["name"]
@@ -117,8 +116,8 @@ def _export(args: Namespace) -> None:
         cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {made}")
     if args.crazyflie and args.flights:
         flights = Reading(args.survey).flights(args.flights)
-        errors = crazyflie.comparison(args.crazyflie, Path(args.firmware), flights, stddev)
-        cli.show(crazyflie.in_words(errors, [one.name for one in flights], stddev))
+        errors = c_code.comparison(args.crazyflie, Path(args.firmware), flights, stddev)
+        cli.show(c_code.in_words(errors, [one.name for one in flights], stddev))
     elif args.crazyflie:
         say(f"{args.crazyflie}: not tried on flights; give --firmware and --flights.")
 

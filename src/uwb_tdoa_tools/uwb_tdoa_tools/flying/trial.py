@@ -24,9 +24,8 @@ from uwb_tdoa_ekf.core.yaw_check import YAW_KNOWN
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of, rotation_std
 
-from .controller import SUPPORT_TIME, Controller, integrate
 from .mission import DONE, LOST, REFUSED, Circles, Mission, Pose, Rules, TimedPath, Waypoints
-from .simulator import DT, Simulator, Streams, Transport
+from .simulator import DT, SUPPORT_TIME, Controller, Simulator, Streams, Transport, integrate
 from .vehicle import ATTITUDE, GRAVITY, IMU_RATE, POSITION, World, random
 
 _NO_VECTORS = np.empty((0, 3))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..lazy import rotations
+from ..arrays import rotations
 from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
 
 FASTEST = 100.0  # m/s, and rad/s
