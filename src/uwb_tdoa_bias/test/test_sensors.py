@@ -262,7 +262,7 @@ def test_which_ranges_are_measurements(d, variance, usable):
 
 
 def found(ranges):
-    return [mistake.rule for rule in SENSORS["range"].rules if (mistake := rule(ranges, ANCHORS))]
+    return [mistake[0] for rule in SENSORS["range"].rules if (mistake := rule(ranges, ANCHORS))]
 
 
 def test_rules_name_what_is_wrong_with_ranges_and_nothing_else():

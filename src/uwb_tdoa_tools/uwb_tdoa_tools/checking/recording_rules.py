@@ -38,14 +38,7 @@ def sensor_mistakes(recording: Recording) -> Iterator[Finding]:
         for rule in SENSORS[name].rules:
             found = rule(stream, recording.anchors)
             if found is not None:
-                yield Finding(
-                    found.rule,
-                    ERROR if found.severe else WARNING,
-                    cause=found.cause,
-                    evidence=found.evidence,
-                    remedy=found.remedy,
-                    value=found.value,
-                )
+                yield Finding(*found)
 
 
 def frames(recording: Recording) -> Iterator[Finding]:

@@ -77,8 +77,9 @@ def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
             f"{100.0 * share:.0f} % of the ranges are to {heard}; the survey begins with {known}"
         )
         remedy = "--survey FILE  # with all anchors, under the ids that the tag reports"
-        return Mistake(
+        return (
             "range_unknown",
+            "error",
             "ranges are to anchors that the survey does not list",
             evidence,
             remedy,
@@ -96,8 +97,13 @@ def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
             f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
         )
         remedy = "publish metres: divide millimetres by 1000, multiply seconds by 299792458"
-        return Mistake(
-            "range_unit", "ranges are in another unit than metres", evidence, remedy, middle
+        return (
+            "range_unit",
+            "error",
+            "ranges are in another unit than metres",
+            evidence,
+            remedy,
+            middle,
         )
     return None
 
@@ -110,13 +116,13 @@ def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
             f"{100.0 * share:.1f} % of the ranges are 0 or less, no numbers, or more than "
             f"{FARTHEST:g} m"
         )
-        cause = (
-            "most ranges cannot be distances"
+        severity, cause = (
+            ("error", "most ranges cannot be distances")
             if share > MOST
-            else "some ranges cannot be distances: they are lost"
+            else ("warning", "some ranges cannot be distances: they are lost")
         )
         remedy = "publish |p - a| in metres, and nothing where the exchange has failed"
-        return Mistake("range_invalid", cause, evidence, remedy, share, share > MOST)
+        return "range_invalid", severity, cause, evidence, remedy, share
     return None
 
 

@@ -95,25 +95,9 @@ class Compared:
     positions: tuple = (2,)
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """A finding of a rule of `check`.
-
-    Attributes
-    ----------
-    rule : its name
-    cause : what is wrong
-    evidence : the numbers that show it
-    remedy : a line to copy
-    value : the number that decided
-    """
-
-    rule: str
-    cause: str
-    evidence: str
-    remedy: str
-    value: float
-    severe: bool = True  # False: a warning
+# Of a Finding of `check`: rule, severity ("error" or "warning"), cause, evidence (the numbers that show
+# it), remedy (a line to copy), and the number that decided.
+Mistake = tuple[str, str, str, str, str, float]
 
 
 @dataclass(frozen=True)
