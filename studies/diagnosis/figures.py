@@ -19,7 +19,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.surveying.report import with_blocked
 
 from .. import table
-from . import bank, blind, measured, splits, unlisted
+from . import bank, blind, hand_eye, measured, splits, unlisted
 
 
 def add_options(add):
@@ -57,6 +57,10 @@ def _blind(args):
 def _unlisted(args):
     cases = [(kind, seed) for kind in unlisted.KINDS for seed in table.seeds(args)]
     return unlisted.figures(list(table.results(unlisted.run, cases, args)))
+
+
+def _arms(args):
+    return hand_eye.figures(list(table.results(hand_eye.run, table.seeds(args), args)))
 
 
 def _costly(args, function):
@@ -127,6 +131,7 @@ PARTS = {
     "sensors": partial(_bank, aided=True),
     "blind": _blind,
     "unlisted": _unlisted,
+    "arms": _arms,
     "measured": _measured,
     "measured-sensors": partial(_measured, names=measured.AIDED, sensors=SENSOR_NAMES),
     "rows": _rows,

@@ -20,7 +20,8 @@ DESCRIPTION = """Find systematic errors in the measurements of some flights, and
 Computes the residuals of every channel, and traces them to effects that the model lacks, with their uncertainty and
 alternatives. Adds the effects that help, and reports the error before and after on hold-out data.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
-assume with them; --config of evaluate) and report.html.
+assume with them; --config of evaluate) and report.html. If the ground truth is in another frame, truth_to_survey.txt has its
+transform.
 Exit code: 0 done; 1 ids, signs or units are wrong, or the survey is of another room, and --no-truth or --reference marks is given;
 2 bad input."""
 
@@ -230,7 +231,11 @@ def _diagnose(args: Namespace) -> int:
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
     write_text(out / "report.html", html(result))
-    for name, text in result.next_flight.files().items() if result.next_flight else ():
+    more_files = {
+        **(result.next_flight.files() if result.next_flight else {}),
+        **(result.truth_transform.files() if result.truth_transform else {}),
+    }
+    for name, text in more_files.items():
         write_text(out / name, text)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
@@ -238,7 +243,7 @@ def _diagnose(args: Namespace) -> int:
     files = (
         *("diagnosis.json", "effects.yaml"),
         *["ekf_node.yaml"][: parameters is not None],
-        *(result.next_flight.files() if result.next_flight else ()),
+        *more_files,
     )
     cli.show(f"wrote {', '.join(files)} and report.html to {out}")
     return 0

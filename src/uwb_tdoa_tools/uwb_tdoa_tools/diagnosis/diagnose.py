@@ -27,6 +27,7 @@ from .attribution import Attribution, EffectSearch, residuals_of
 from .channels import CHANNELS, health
 from .detectors import Detection
 from .findings import EffectFinding, Refused, usable
+from .frames import moved_together
 from .noise import DECIMALS
 from .references import GroundTruth, Reference
 from .refinement import written
@@ -94,11 +95,14 @@ def diagnose(
     ):
         settled.append((flight.without(*unused), said))
         looking()
-    judge_truth = {flight.name: said for flight, said in settled if said}
     count = len(flights)
-    fitted, held_out = (
-        tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:])
-    )
+    moved, transform = moved_together(prepared, [flight for flight, _ in settled], count, base)
+    in_a_frame = transform.flights if transform else ()
+    judge_truth = {  # the last sentence is on the frame
+        flight.name: said[:-1] if flight.name in in_a_frame else said for flight, said in settled
+    }
+    judge_truth = {name: said for name, said in judge_truth.items() if said}
+    fitted, held_out = tuple(moved[:count]), tuple(moved[count:])
 
     repairs = (
         repairing.repaired(fitted, base, config, work.saying("looking at ids and signs"))
@@ -144,6 +148,7 @@ def diagnose(
         },
         outcome.changes,
         judge_truth=judge_truth,
+        truth_transform=transform,
         cases=tuple(outcome.cases),
         share=outcome.share,
         base=base,

@@ -40,6 +40,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()
             },
             "ground_truth": {name: list(said) for name, said in diagnosis.judge_truth.items()},
+            "truth_transform": diagnosis.truth_transform and diagnosis.truth_transform.as_dict(),
             "unattributed": [
                 _function(item, item.function) for item in diagnosis.findings if item.function
             ],

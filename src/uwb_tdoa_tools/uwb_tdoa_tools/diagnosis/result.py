@@ -16,6 +16,7 @@ from .channels import ChannelResiduals
 from .channels.base import Figures
 from .comparison import ValidationCase
 from .findings import EffectFinding, Refused
+from .frames import TruthTransform
 from .next_flight import NextFlight
 from .references import Reference
 from .regression.confounding import Unobservable
@@ -42,6 +43,7 @@ class Diagnosis:
     changes : sentences, changes since the last calibration
     applying : ((command line, its purpose), ...), commands that apply the effects
     judge_truth : {name of a flight: sentences}, clock or frame errors of its ground truth
+    truth_transform : TruthTransform of the ground truth to the survey; None if it is not moved
     cases : (ValidationCase, ...) that `after` is of
     share : of the fitted values that is applied, because few flights support less
     tdoa_std : m, noise for the filter beside these effects, None if it was not measured
@@ -66,6 +68,7 @@ class Diagnosis:
     changes: tuple[str, ...] = ()
     applying: tuple[tuple[str, str], ...] = ()
     judge_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    truth_transform: TruthTransform | None = None
     cases: tuple[ValidationCase, ...] = ()
     share: float = 1.0
     tdoa_std: float | None = None

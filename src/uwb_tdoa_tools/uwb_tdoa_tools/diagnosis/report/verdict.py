@@ -278,9 +278,11 @@ def faults_in_words(diagnosis: Diagnosis) -> list[str]:
 
 def truth_in_words(diagnosis: Diagnosis) -> list[str]:
     """Return sentences on clock and frame errors of the ground truth."""
-    return [
+    each = [
         f"{name}: {sentence}." for name, said in diagnosis.judge_truth.items() for sentence in said
     ]
+    found = diagnosis.truth_transform
+    return each + ([f"{_few(found.flights)}: {found.in_words()}"] if found else [])
 
 
 def centimetres(value: float) -> str:
