@@ -17,12 +17,14 @@ from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.findings import Refused
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
+from uwb_tdoa_tools.diagnosis.regression.confounding import levels
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.products import FINE, _Bins, _Subset
 from uwb_tdoa_tools.diagnosis.regression.scan import Scan, _held
 from uwb_tdoa_tools.diagnosis.regression.select import select
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of
+from uwb_tdoa_tools.diagnosis.report.entries import Entry
 
 # --- attribution ---
 
@@ -279,6 +281,41 @@ def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flig
     more, fewer = (select(table, [one], inflation) for one in (whole, along_z))
     monkeypatch.setattr(refinement, "SAME_STORY", 0.3)
     assert _simpler(more, fewer, 10) is _simpler(fewer, more, 10) is more
+
+
+@pytest.mark.parametrize(
+    "name, values, delay, moved",
+    [
+        ("anchor_delay", {"4": 0.28}, 0.28, False),
+        ("anchor_delay", {"4": -0.28}, -0.28, False),
+        ("anchor_position", {"4.x": 0.3, "4.y": -0.2}, None, True),
+    ],
+)
+def test_functions_of_an_anchor_have_one_level(flight, name, values, delay, moved):
+    """Both functions share it, and neither names it. A move of the anchor explains the rest."""
+    wrong = EFFECTS[name](values).inject(flight)
+    declared = [
+        one for effect in ("anchor_delay", "anchor_position")
+        for one in candidates_of(EFFECTS[effect](), flight.anchors, None)
+    ]  # fmt: skip
+    terms = [
+        SmoothTerm(covariate=covariate, form="anchor", knots=(-2.0, 2.0), shape="line")
+        for covariate in ("x", "y", "height", "bearing")
+    ]
+    functions = [Candidate((Term(term, term.keys_of(("4",))),)) for term in terms]
+    found = residuals_of([wrong], TRUTH, EffectSet())
+    table = refinement.linearised(found, [*declared, *functions], ())
+    selection = select(table, [], fit(table, []).inflation, start=functions)
+    ((anchor, level),) = levels(selection, declared).items()
+    assert anchor == "4" and (level.explained > 0.7) == moved
+    if moved:
+        assert level.shift[0] == pytest.approx(0.3, abs=0.1)
+    else:
+        assert level.delay == pytest.approx(delay, abs=0.04)
+    (finding, *others) = attribution._findings(selection, declared, ("flight",))
+    assert finding.levels == {"4": level} and not any(one.levels for one in others)
+    (said,) = Entry((finding,), "", "", "").levels
+    assert ("farther" in said) == (level.delay > 0.0) and ("a move by" in said) == moved
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ from .refinement import (
     with_measured_noise,
     with_smooth,
 )
-from .regression.confounding import alternatives
+from .regression.confounding import alternatives, levels
 from .regression.fit import Fit, fit, in_common, prior_sizes
 from .regression.held_out import held_out
 from .regression.products import FOR_MAPS
@@ -567,6 +567,7 @@ def _findings(
 ) -> list[EffectFinding]:
     effects = {entry_of(effect): effect for effect in effects_of(selection)}
     out: dict[Hashable, EffectFinding] = {}
+    of_anchors = levels(selection, candidates)
     for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
         evidence = {
             "criterion": round(float(loss), 1),
@@ -591,6 +592,11 @@ def _findings(
                 (candidate,),
                 together_with=covariates,
                 shares=shares(selection, candidate, names),
+                levels={
+                    anchor: of_anchors.pop(anchor)
+                    for anchor in [*of_anchors] * bool(term.function)
+                    if any(key.startswith(f"{anchor}.") for key in term.keys)
+                },
             )
             out[identity] = _merged(out[identity], finding) if identity in out else finding
     return list(out.values())
@@ -616,6 +622,7 @@ def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
         explained=max(finding.explained, other.explained),
         alternatives=(*finding.alternatives, *more),
         candidates=(*finding.candidates, *other.candidates),
+        levels=finding.levels | other.levels,
     )
 
 

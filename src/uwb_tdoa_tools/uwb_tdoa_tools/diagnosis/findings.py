@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from uwb_tdoa_bias.effects import Effect, EffectSet, SmoothTerm
 
 from .over_flights import Share
-from .regression.confounding import Alternative
+from .regression.confounding import Alternative, Level
 from .regression.terms import Candidate
 
 # m, added to the worth of a finding, so that a certain finding precedes an uncertain worthless one
@@ -30,6 +30,7 @@ class EffectFinding:
     worth : m, increase of the filter's 3D RMSE without it; None if not tried
     together_with : covariates of the same candidate; shares : (Share, ...), amount in each flight
     flight : name of the only flight with it; None for a fit to all flights
+    levels : {anchor: Level}, of the first function without a name of each anchor
     on_floor : whether it was found near the floor, beyond effects in the air
     """
 
@@ -44,6 +45,7 @@ class EffectFinding:
     together_with: tuple[str, ...] = ()
     shares: tuple[Share, ...] = ()
     flight: str | None = None
+    levels: dict[str, Level] = field(default_factory=dict)
     on_floor: bool = False
 
     @property

@@ -133,6 +133,7 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
         "alternatives": _alternatives(finding),
         "evidence": finding.evidence,
         "together_with": list(finding.together_with),
+        "levels": {anchor: vars(level) for anchor, level in finding.levels.items()},
         "shape": {
             "at": at,
             "values": {

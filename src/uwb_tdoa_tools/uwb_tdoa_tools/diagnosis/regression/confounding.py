@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
+from uwb_tdoa_ekf.evidence import DELAY, POSITION
 
 from .algebra import dense, product, weighted
 from .fit import prior_sizes
@@ -34,6 +35,19 @@ class Alternative:
     share: float | None
     gap: float | None
     tell_apart: str
+
+
+@dataclass(frozen=True)
+class Level:
+    """The constant part of all functions of an anchor, and what a move of it explains of them.
+
+    delay : m, by which the anchor seems farther on average, relative to the others
+    shift : (x, y, z) m of the anchor that explains most beside a delay; explained : its share
+    """
+
+    delay: float
+    shift: tuple[float, float, float]
+    explained: float
 
 
 @dataclass(frozen=True)
@@ -118,6 +132,44 @@ def _shares(
         share = (2.0 * vector @ solution - solution @ gram @ solution) / power
         if share >= ALIKE:
             out[name] = round(float(share), 3)
+    return out
+
+
+def levels(selection: Selection, candidates: Sequence[Candidate]) -> dict[str, Level]:
+    """Return the Level of each anchor that has functions without a name in the TDOAs.
+
+    Functions of an anchor share a constant, so it belongs to none of them. It is a projection of
+    their sum on the delay of the anchor, and on its delay and position.
+
+    candidates : all declared Candidates
+    """
+    table, model, of_anchors = selection.table, selection.fit, _whole(candidates)
+    own: dict[str, list[Column]] = {}
+    for term in (term for one in selection.chosen for term in one.terms):
+        if (
+            term.function
+            and term.function.form == "anchor"
+            and term.function.channel == EFFECTS[DELAY].channels[0]
+        ):
+            for column in term.columns:
+                own.setdefault(column.key.partition(".")[0], []).append(column)
+    root, out = np.sqrt(model.information(table)), {}
+    for anchor, columns in own.items():
+        part = (table.matrix(columns) @ model.values(columns)) * root
+        named = [
+            column
+            for name in (DELAY, POSITION)
+            for column in of_anchors.get(name, ())
+            if column.key.partition(".")[0] == anchor
+        ]
+        if len(named) < 4 or not part.any():
+            continue
+        x = dense(weighted(table.matrix(named), root))
+        (delay,) = np.linalg.lstsq(x[:, :1], part, rcond=None)[0]
+        rest = part - x[:, 0] * delay
+        moved = np.linalg.lstsq(x, part, rcond=None)[0]
+        explained = 1.0 - np.sum((part - x @ moved) ** 2) / max(rest @ rest, 1e-12)
+        out[anchor] = Level(float(delay), tuple(moved[1:].tolist()), float(explained))
     return out
 
 

@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.evidence import DELAY
 
 from ..findings import EffectFinding, Refused
 from ..over_flights import ALL, course, in_words
-from ..regression.confounding import Alternative
+from ..regression.confounding import Alternative, Level
 from ..result import Diagnosis
 from ..validation import LEAST_WORTH
 
@@ -24,6 +24,7 @@ WORTH_DOING = 0.01  # m, smallest gain in position that is worth an action
 SMALLEST_DELAY = 0.03  # m; an anchor whose delay differs by less from the others is not named
 DEGREES = float(np.degrees(1.0))  # degrees per radian
 FORMS = {"arrival": " (of each arrival)", "anchor": " (by anchor)"}
+MOVED = 0.7  # smallest share of functions, without their level, that makes an anchor one that moved
 SHOWN = 6  # largest number of shown values
 
 
@@ -83,6 +84,13 @@ class Entry:
         nameless = [finding.effect for finding in self.findings if not finding.declared]
         said = (sentence for effect in nameless for sentence in effect.advice()[1:])
         return tuple(dict.fromkeys(said))
+
+    @property
+    def levels(self) -> list[str]:
+        """Return sentences on anchors that seem farther or nearer on average, by its functions."""
+        found = [pair for finding in self.findings for pair in finding.levels.items()]
+        large = [(name, one) for name, one in found if abs(one.delay) > SMALLEST_DELAY]
+        return [_level_in_words(*pair) for pair in large] if len(large) <= SHOWN else []
 
     @property
     def differing(self) -> str:
@@ -165,6 +173,16 @@ def without_common_part(effect: Effect, anchors: Iterable[int]) -> Effect:
         values=named,
         std={name: known for name, known in effect.std.items() if name in named},
     )
+
+
+def _level_in_words(anchor: str, level: Level) -> str:
+    """Return a sentence on the Level of an anchor."""
+    way = "farther" if level.delay > 0.0 else "nearer"
+    words = f"On average anchor {anchor} seems {abs(level.delay):.2f} m {way} than the others"
+    if level.explained > MOVED and np.linalg.norm(level.shift) > SMALLEST_DELAY:
+        shift = ", ".join(f"{value:.2f}" for value in level.shift)
+        return f"{words}, and a move by ({shift}) m explains {level.explained:.0%} of the rest."
+    return f"{words}, as with another antenna delay."
 
 
 def worth_in_words(entry: Entry) -> str:

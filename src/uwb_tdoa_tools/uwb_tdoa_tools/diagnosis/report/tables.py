@@ -112,6 +112,7 @@ def tasks(found: Iterable[Entry]) -> list[list[tuple[Entry, list[str]]]]:
     for entry in found:
         task = out.setdefault(entry.causes or entry.title, [])
         said = [sentence for one in entry.findings for sentence in advice(one.effect)]
+        said[1:1] = entry.levels
         known = entry.causes if task else ()
         task.append((entry, [one for one in dict.fromkeys(said) if one not in known]))
     return list(out.values())

@@ -169,7 +169,7 @@ def _cause_and_doubt(diagnosis: Diagnosis, found: Sequence[Entry]) -> str:
         if entry.worth and entry.worth >= WORTH_DOING
     ]
     rest = f" Also {listed(more)}; what they share is not counted." if more else ""
-    return f"{what[0].upper()}{what[1:]}. {_doubt(first)}{rest}"
+    return " ".join([f"{what[0].upper()}{what[1:]}. {_doubt(first)}{rest}", *first.levels])
 
 
 def _doubt(entry: Entry) -> str:
