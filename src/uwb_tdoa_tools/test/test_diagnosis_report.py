@@ -36,7 +36,7 @@ from uwb_tdoa_tools.scoring.metrics import NO_DIFFERENCE
 # --- artificial findings and diagnoses, and parsed pages ---
 
 # Keys of diagnosis.json whose content has names as keys: parameters, anchors, lags.
-NAMES_BELOW = {"parameters", "std", "direction", "values", "autocorrelation"}
+NAMES_BELOW = {"parameters", "std", "direction", "values"}
 
 
 def said(page):

@@ -128,7 +128,9 @@ class Attribution:
         The order is: from regression, from detectors, near the floor, in single flights.
         """
         out = _findings(self.selection, self.candidates, self.names)
-        out += map(_of_detection, self.detections)
+        out += [
+            EffectFinding(one.effect, one.channel, one.evidence, 0.0) for one in self.detections
+        ]
         if self.floor:
             written = {entry_of(effect): effect for effect in self.of_floor}
             near = _findings(self.floor, [], self.floor_names)
@@ -288,7 +290,9 @@ class EffectSearch:
 
         Added are rivals of effects, effects in one flight only, and effects near the floor.
         """
-        selection = self._with_alternatives(found.selection)
+        scan = self._scan_of(found.selection.table) if self._undeclared else None
+        everything = self.declared + self._smooth
+        selection = with_rivals(found.selection, everything, scan, self.progress)
         remaining = self.residuals(effects_of(selection))
         alone: tuple[tuple[str, Selection], ...] = ()
         positions_known = all(self.residuals.reference.positions_known)
@@ -372,11 +376,6 @@ class EffectSearch:
         )
         return relinearised(selection, self.residuals, self.declared + self._smooth)
 
-    def _with_alternatives(self, selection: Selection) -> Selection:
-        """Return the Selection with the rivals of each effect."""
-        scan = self._scan_of(selection.table) if self._undeclared else None
-        return with_rivals(selection, self.declared + self._smooth, scan, self.progress)
-
     def _detections(self, selection: Selection) -> tuple[Detection, ...]:
         """Return what the detectors find in the residuals under a Selection."""
         remaining = self.residuals(effects_of(selection))
@@ -453,7 +452,15 @@ def on_floor(
         scan = Scan(table, views)
         inflation = inflation_of(table, [], lambda *fitted: scan(*fitted)[:1])
         found = select(table, [], inflation, scan=scan, progress=progress)
-        found = found.only([one for one in found.chosen if _is_large(one, found)])
+        # A smaller contribution can depend on the place, and a few seconds do not determine that.
+        found = found.only(
+            [
+                one
+                for one in found.chosen
+                if np.ptp(found.table.matrix(one.columns) @ found.fit.values(one.columns))
+                > ON_FLOOR
+            ]
+        )
     return cross_validated(found, refused)
 
 
@@ -553,15 +560,6 @@ def _smooth(
     return out
 
 
-def _is_large(candidate: Candidate, selection: Selection) -> bool:
-    """Return whether the contribution of a chosen Candidate varies by more than ON_FLOOR.
-
-    A smaller contribution can depend on the place, and a few seconds do not determine that.
-    """
-    part = selection.table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
-    return np.ptp(part) > ON_FLOOR
-
-
 def _findings(
     selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]
 ) -> list[EffectFinding]:
@@ -585,7 +583,7 @@ def _findings(
             covariates = tuple(function.covariate for function in beside if function)
             finding = EffectFinding(
                 effects[identity],
-                _shown_on(candidate, selection),
+                next(name for name in candidate.channels if name in selection.table.present),
                 evidence,
                 score.explained,
                 others,
@@ -624,12 +622,3 @@ def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
         candidates=(*finding.candidates, *other.candidates),
         levels=finding.levels | other.levels,
     )
-
-
-def _shown_on(candidate: Candidate, selection: Selection) -> str:
-    """Return the first channel of a Candidate that the table contains."""
-    return next(name for name in candidate.channels if name in selection.table.present)
-
-
-def _of_detection(detection: Detection) -> EffectFinding:
-    return EffectFinding(detection.effect, detection.channel, detection.evidence, 0.0)

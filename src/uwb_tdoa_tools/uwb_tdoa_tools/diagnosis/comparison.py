@@ -171,11 +171,11 @@ def innovations(
         for case, run in runs:
             figures: dict[str, Any] = {
                 "nis_mean": float(nis(radio_residuals(case.flight, run)).mean()),
-                "residual_spread": _scale(_used(run)),
+                "residual_spread": _spread(run),
             }
             rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
         means = {
-            key: float(np.mean([row[key] for row in rows]))
+            key: float(np.mean([row[key] for row in rows if row[key] is not None]))
             for key in ("nis_mean", "residual_spread")
         }
         sides.append({"runs": rows, "pooled": dict(means, rmse_3d=None), "scores": []})
@@ -257,21 +257,12 @@ def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
 
 
 def _spread(run: Run) -> float | None:
-    innovation = run.residuals.innovation[run.residuals.verdict == USED]
-    return _scale(innovation) if len(innovation) else None
-
-
-def _scale(innovation: np.ndarray) -> float:
-    return float(1.4826 * np.median(np.abs(innovation)))
-
-
-def _used(run: Run) -> np.ndarray:
-    """Return innovations of the used TDOAs of a Run, or of its ranges without TDOAs, (n,) m."""
-    residuals = run.residuals
-    if len(residuals) or RANGES not in run.sensors:
-        return residuals.innovation[residuals.verdict == USED]
-    ranges = run.sensors[RANGES]
-    return np.asarray(ranges["innovation"][ranges["verdict"] == USED])
+    """Return 1.48 MAD of the innovations of the used TDOAs of a Run, or of its ranges without any, m."""
+    innovation, verdict = run.residuals.innovation, run.residuals.verdict
+    if not len(innovation) and RANGES in run.sensors:
+        innovation, verdict = (run.sensors[RANGES][key] for key in ("innovation", "verdict"))
+    used = innovation[verdict == USED]
+    return float(1.4826 * np.median(np.abs(used))) if len(used) else None
 
 
 def _blocks(judged: Score) -> np.ndarray:

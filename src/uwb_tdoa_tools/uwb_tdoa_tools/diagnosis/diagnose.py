@@ -97,11 +97,11 @@ def diagnose(
         looking()
     count = len(flights)
     moved, transform = moved_together(prepared, [flight for flight, _ in settled], count, base)
-    in_a_frame = transform.flights if transform else ()
-    judge_truth = {  # the last sentence is on the frame
-        flight.name: said[:-1] if flight.name in in_a_frame else said for flight, said in settled
+    judge_truth = {  # without the last sentence, on the frame, which the transform replaces
+        flight.name: left
+        for flight, said in settled
+        if (left := said[:-1] if transform and flight.name in transform.flights else said)
     }
-    judge_truth = {name: said for name, said in judge_truth.items() if said}
     fitted, held_out = tuple(moved[:count]), tuple(moved[count:])
 
     repairs = (

@@ -97,28 +97,20 @@ class TruthTransform:
         yaw, pitch, roll = Rotation.from_matrix(self.turn).as_euler("ZYX", degrees=True)
         x, y, z = self.shift
         about, off = (max(self.std[name] for name in names) for names in (FRAME[:3], FRAME[3:]))
-        words = (
+        unsure = ", ".join(self.undetermined)
+        limits = "0.5 degrees, 2 cm of the frame, 1 cm of the lever arm and 10 ms"
+        return (
             "the ground truth is in another frame than the survey. It is moved to judge by, and "
             f"nodes get nothing of that: turned by yaw {yaw:.1f}, pitch {pitch:.1f}, roll "
             f"{roll:.1f} degrees (± {np.rad2deg(about):.1f}), then shifted by ({x:.3f}, {y:.3f}, "
             f"{z:.3f}) m (± {off:.3f} in the middle of the path). To apply it: {'; '.join(TO_APPLY)}."
-        )
-        if not self.undetermined:
-            return words
-        return (
-            f"{words} Not determined within 0.5 degrees, 2 cm of the frame, 1 cm of the lever arm "
-            f"and 10 ms: {', '.join(self.undetermined)}."
+            + f" Not determined within {limits}: {unsure}."
+            * bool(unsure)
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """TDOAs of a flight: at p, with rows a and b of anchors, attitudes, velocities, blocks."""
-
-    d: np.ndarray
-    samples: Samples
-    turns: np.ndarray | None
-    block: np.ndarray
+# TDOAs d (n,) m of a flight, their Samples, and attitudes (n, 3, 3), None if unknown
+_Part = tuple[np.ndarray, Samples, np.ndarray | None]
 
 
 def moved_together(
@@ -134,7 +126,7 @@ def moved_together(
     """
     found: dict[int, tuple[Flight, TruthTransform]] = {}
     for k, (one, other) in enumerate(zip(recorded, settled)):
-        if one.truth is None or not len(one.tdoa) or one.truth.p is other.known_truth.p:
+        if one.truth is None or not len(one.tdoa):
             continue
         clocked = replace(one, truth=replace(one.truth, t=other.known_truth.t))
         start = rigid_transform(one.truth.p, other.known_truth.p)
@@ -151,11 +143,11 @@ def moved_together(
         late=recorded[min(found)].known_truth.t[0] - first.known_truth.t[0],
         flights=tuple(flight.name for flight, _ in found.values()),
     )
-    out = list(settled)
-    for k, (flight, _) in found.items():
-        truth = transform_truth(flight.known_truth, common.turn, common.shift)
-        out[k] = replace(settled[k], truth=truth)
-    return out, common
+    out = {
+        k: replace(settled[k], truth=transform_truth(one.known_truth, common.turn, common.shift))
+        for k, (one, _) in found.items()
+    }
+    return [out.get(k, flight) for k, flight in enumerate(settled)], common
 
 
 def fitted(
@@ -166,12 +158,12 @@ def fitted(
     turn, shift : (3, 3) and (3,) m to start from; base : EffectSet of the model
     """
     parts = [_rows(flight, turn, shift, base) for flight in flights]
-    heard = np.unique(np.concatenate([[part.samples.a, part.samples.b] for part in parts], axis=1))
-    names = [*FRAME, "clock", *LEVER * all(part.turns is not None for part in parts)]
+    heard = np.unique(np.concatenate([[some.a, some.b] for _, some, _ in parts], axis=1))
+    names = [*FRAME, "clock", *LEVER * all(turns is not None for *_, turns in parts)]
     first = len(names)
     names += [f"delay.{flights[0].anchors.ids[row]}" for row in heard]
     prior = np.diag([PRIOR.get(name, DELAY) ** -2.0 for name in names])
-    middle = np.concatenate([part.samples.p for part in parts]).mean(axis=0)
+    middle = np.concatenate([some.p for _, some, _ in parts]).mean(axis=0)
     x, more = np.zeros(len(names)), np.eye(3)  # the turn goes on from `more`
     for _ in range(STEPS):
         made = [_equations(part, more, middle, x, heard, first) for part in parts]
@@ -183,7 +175,8 @@ def fitted(
         more = Rotation.from_rotvec(step[:3]).as_matrix() @ more
         x[3:] += step[3:]
     score = (weight * r)[:, None] * J
-    block = np.cumsum(np.append(0, np.diff(np.concatenate([part.block for part in parts])) != 0))
+    blocks = [np.column_stack([0 * d + k, some.t // BLOCK]) for k, (d, some, _) in enumerate(parts)]
+    block = np.unique(np.concatenate(blocks), axis=0, return_inverse=True)[1].reshape(-1)
     sums = np.stack([np.bincount(block, column) for column in score.T], axis=1)
     std = np.sqrt(np.maximum(np.diag(inverse @ (sums.T @ sums) @ inverse), np.diag(inverse)))
     return TruthTransform(
@@ -195,7 +188,7 @@ def fitted(
     )
 
 
-def _rows(flight: Flight, turn: np.ndarray, shift: np.ndarray, base: EffectSet) -> _Rows:
+def _rows(flight: Flight, turn: np.ndarray, shift: np.ndarray, base: EffectSet) -> _Part:
     truth = transform_truth(flight.known_truth, turn, shift)
     samples, rows = true_samples(replace(flight, truth=truth))
     _, begin, end = scored_phase(truth)
@@ -203,29 +196,28 @@ def _rows(flight: Flight, turn: np.ndarray, shift: np.ndarray, base: EffectSet) 
     used = (samples.t > begin) & (samples.t < end) & np.isfinite(d)
     of_rows = {k: v[used] for k, v in vars(samples).items() if isinstance(v, np.ndarray)}
     some = replace(samples, **of_rows)
-    known = np.isfinite(some.q).all()
-    turns = Rotation.from_quat(some.q).as_matrix() if known else None
-    return _Rows(d[used], some, turns, np.floor(some.t / BLOCK))
+    turns = Rotation.from_quat(some.q).as_matrix() if np.isfinite(some.q).all() else None
+    return d[used], some, turns
 
 
 def _equations(
-    part: _Rows, more: np.ndarray, middle: np.ndarray, x: np.ndarray, heard: np.ndarray, first: int
+    part: _Part, more: np.ndarray, middle: np.ndarray, x: np.ndarray, heard: np.ndarray, first: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return Jacobian (n, k) and residual (n,) m of a flight."""
-    samples, J = part.samples, np.zeros((len(part.d), len(x)))
-    arms = np.zeros((len(part.d), 3)) if part.turns is None else part.turns @ x[7:10]
+    (d, samples, turns), J = part, np.zeros((len(part[0]), len(x)))
+    arms = np.zeros((len(d), 3)) if turns is None else turns @ x[7:10]
     away = (samples.p - middle + samples.velocity * x[6] + arms) @ more.T
     place = away + middle + x[3:6]
     slope = samples.position_jacobian(place)
     J[:, :3], J[:, 3:6] = np.cross(away, slope), slope
     J[:, 6] = np.sum(slope * (samples.velocity @ more.T), axis=1)
-    if part.turns is not None:
-        J[:, 7:10] = np.einsum("ni,nij->nj", slope @ more, part.turns)
+    if turns is not None:
+        J[:, 7:10] = np.einsum("ni,nij->nj", slope @ more, turns)
     rows = np.arange(len(J))
     a, b = (first + np.searchsorted(heard, end) for end in (samples.a, samples.b))
     J[rows, b] += 1.0
     J[rows, a] -= 1.0
-    return J, part.d - samples.predicted(place) - x[b] + x[a]
+    return J, d - samples.predicted(place) - x[b] + x[a]
 
 
 def _differ(first: TruthTransform, other: TruthTransform, truth: Truth) -> bool:

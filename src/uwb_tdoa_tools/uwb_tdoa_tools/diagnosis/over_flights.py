@@ -23,13 +23,12 @@ SURE = 4.0  # standard deviations of a significant difference
 # largest difference of equal shares; no model is more accurate
 ALIKE = 0.3
 SHOWN = 3.0  # standard deviations of a share that a flight shows
-GROWN = 0.5  # smallest growth of the share, from the first flight to the last
 # Prior of the spread of shares between flights: standard deviation, and how many flights it counts
 # for.
 SPREAD, SPREAD_FLIGHTS = (0.2, 2)
 HALF = 0.5  # a correction does harm if a flight has a smaller share of the effect
 
-ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"
+ALL, ALONE, DIFFERS = "all", "alone", "differs"
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def harm(several: Sequence[Share]) -> float:
 
 
 def course(several: Sequence[Share]) -> str | None:
-    """Return ALL, ALONE, GROWS or DIFFERS; None if fewer than two flights determine a share.
+    """Return ALL, ALONE or DIFFERS; None if fewer than two flights determine a share.
 
     several : Shares in the order of the flights
     """
@@ -139,17 +138,6 @@ def course(several: Sequence[Share]) -> str | None:
     spread = np.maximum(ALIKE, SURE * std)
     if (np.abs(share - np.average(share, weights=std**-2)) < spread).all():
         return ALL
-    order = np.arange(len(determined)) - 0.5 * (len(determined) - 1)
-    steps = np.diff(share) * np.sign(share[-1] - share[0])
-    slope, sure = order @ share / (order @ order), np.sqrt(order**2 @ std**2) / (order @ order)
-    rising = (steps > -2.0 * np.hypot(std[1:], std[:-1])).all()
-    if (
-        len(determined) > 2
-        and rising
-        and abs(slope) > SURE * sure
-        and abs(share[-1] - share[0]) > GROWN
-    ):
-        return GROWS
     return DIFFERS
 
 
@@ -163,7 +151,7 @@ def in_words(several: Sequence[Share]) -> str:
     if kind == ALONE:
         return f"Belongs to {max(determined, key=lambda each: abs(each.share)).flight} alone."
     listed = ", ".join(f"{each.share:.1f} in {each.flight}" for each in determined)
-    return f"{'Grows' if kind == GROWS else 'Differs'} from flight to flight: {listed} of it."
+    return f"Differs from flight to flight: {listed} of it."
 
 
 def of_one(

@@ -72,24 +72,24 @@ def tdoa_parts(residuals: Iterable[ChannelResiduals]) -> list[TdoaResidual]:
 def health(residuals: Sequence[ChannelResiduals], scores: Sequence[Score] = ()) -> Figures:
     """Return figures of residuals and of the filter, each a list of dicts.
 
-    The keys are "pairs", "anchors", "axes", "cross_correlation" and "filter".
+    The keys are "pairs", "anchors", "axes" and "filter".
 
     residuals : [{channel: ChannelResidual}], one per flight
     scores : Score of each flight, for NIS (expected 1) and NEES (expected 3)
     """
-    out: Figures = {key: [] for key in ("pairs", "anchors", "axes", "cross_correlation")}
+    out: Figures = {key: [] for key in ("pairs", "anchors", "axes")}
     for name, channel in CHANNELS.items():
         parts = [flight[name] for flight in residuals if name in flight]
         for key, items in channel.health(parts).items() if parts else ():
             out[key] += items
-    return {**out, "filter": [_filter(score) for score in scores]}
-
-
-def _filter(score: Score) -> dict[str, Any]:
-    return {
-        "flight": score.name,
-        "nis_mean": float(score.nis.mean()),
-        "nis_below_3.84": float(np.mean(score.nis < 3.84)),  # 95 % if the filter is consistent
-        "nees_mean": float(np.mean(score.nees)),
-        "nees_below_7.81": float(np.mean(score.nees < 7.81)),
-    }
+    of_filter = [
+        {
+            "flight": score.name,
+            "nis_mean": float(score.nis.mean()),
+            "nis_below_3.84": float(np.mean(score.nis < 3.84)),  # 95 % if the filter is consistent
+            "nees_mean": float(np.mean(score.nees)),
+            "nees_below_7.81": float(np.mean(score.nees < 7.81)),
+        }
+        for score in scores
+    ]
+    return {**out, "filter": of_filter}

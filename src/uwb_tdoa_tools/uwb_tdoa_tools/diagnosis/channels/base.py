@@ -245,8 +245,5 @@ class Channel(Generic[Own]):
         return []
 
     def health(self, residuals: Sequence[Own]) -> Figures:
-        """Return figures of health of some flights.
-
-        They are {"pairs", "anchors", "axes" or "cross_correlation": rows}.
-        """
+        """Return figures of health of some flights: {"pairs", "anchors" or "axes": rows}."""
         return {}

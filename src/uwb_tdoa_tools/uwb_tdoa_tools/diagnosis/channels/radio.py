@@ -27,7 +27,7 @@ from ...checking.pair_rules import MANY
 from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
 from .base import Channel, ChannelResidual, Comparison, Figures, Rows
-from .figures import APART, figures, health_of_pairs, rows_by_value
+from .figures import figures, health_of_pairs, rows_by_value
 from .views import OF_EACH, CovariateView, extra_at, extra_names, knots_of, views_of_arrivals
 
 CELL = 0.5  # s, length of a cell
@@ -372,20 +372,19 @@ class Ranging(RadioChannel[RangeResidual]):
 
     def health(self, residuals: Sequence[RangeResidual]) -> Figures:
         ids = residuals[0].samples.anchors.ids
-        t, r, _, b = _flown(residuals)
+        r, _, b = _flown(residuals)
         return {
             "axes": [
-                {"axis": f"{self.name} {ids[row]}", **figures(t[mine], r[mine])}
+                {"axis": f"{self.name} {ids[row]}", **figures(r[mine])}
                 for row, mine in rows_by_value(b)
             ]
         }
 
 
 def _flown(parts: Sequence[RadioResidual]) -> tuple[np.ndarray, ...]:
-    """Return stamps, residuals and rows of both anchors, (n,) each, of flights in the air."""
-    columns = []
-    for number, part in enumerate(parts):
-        samples, rows = part.samples, part.airborne
-        t = samples.t[rows] + APART * number
-        columns.append((t, part.residual[rows], samples.a[rows], samples.b[rows]))
+    """Return residuals and rows of both anchors, (n,) each, of flights in the air."""
+    columns = [
+        [column[part.airborne] for column in (part.residual, part.samples.a, part.samples.b)]
+        for part in parts
+    ]
     return tuple(np.concatenate(column) for column in zip(*columns))

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects import Effect, ImuSamples, SensorSamples, SmoothTerm,
 from uwb_tdoa_bias.effects.samples import OF_SENSORS, sensor_covariate
 
 from .base import Channel, ChannelResidual, Comparison, Figures, Rows
-from .figures import APART, figures
+from .figures import figures
 from .views import knots_of
 
 CELL = 0.25  # s, length of a cell; both sides of a residual are averaged over it
@@ -92,15 +92,9 @@ class AxesChannel(Channel[AxesResidual]):
         return out
 
     def health(self, residuals: Sequence[AxesResidual]) -> Figures:
-        stamps = [part.samples.t + APART * number for number, part in enumerate(residuals)]
-        t = np.concatenate(stamps)
         columns = np.concatenate([part.residual for part in residuals]).T
-        out = []
-        for label, column in zip(self.labels, columns):
-            known = np.isfinite(column)
-            if known.any():
-                out.append({"axis": label, **figures(t[known], column[known])})
-        return {"axes": out}
+        known = {label: some[np.isfinite(some)] for label, some in zip(self.labels, columns)}
+        return {"axes": [{"axis": label, **figures(r)} for label, r in known.items() if len(r)]}
 
 
 class Sensor(AxesChannel):

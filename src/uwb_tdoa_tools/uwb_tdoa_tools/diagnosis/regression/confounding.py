@@ -143,33 +143,28 @@ def levels(selection: Selection, candidates: Sequence[Candidate]) -> dict[str, L
 
     candidates : all declared Candidates
     """
-    table, model, of_anchors = selection.table, selection.fit, _whole(candidates)
-    own: dict[str, list[Column]] = {}
-    for term in (term for one in selection.chosen for term in one.terms):
-        if (
-            term.function
-            and term.function.form == "anchor"
-            and term.function.channel == EFFECTS[DELAY].channels[0]
-        ):
-            for column in term.columns:
-                own.setdefault(column.key.partition(".")[0], []).append(column)
-    root, out = np.sqrt(model.information(table)), {}
-    for anchor, columns in own.items():
-        part = (table.matrix(columns) @ model.values(columns)) * root
-        named = [
-            column
-            for name in (DELAY, POSITION)
-            for column in of_anchors.get(name, ())
-            if column.key.partition(".")[0] == anchor
-        ]
+    table, model = selection.table, selection.fit
+    root, out, channel = np.sqrt(model.information(table)), {}, EFFECTS[DELAY].channels[0]
+    functions = [
+        column
+        for term in (term for one in selection.chosen for term in one.terms)
+        if term.function and term.function.form == "anchor" and term.function.channel == channel
+        for column in term.columns
+    ]
+    declared = [column for name in (DELAY, POSITION) for column in _whole(candidates).get(name, ())]
+    for anchor in dict.fromkeys(column.key.partition(".")[0] for column in functions):
+        mine, named = (
+            [column for column in some if column.key.partition(".")[0] == anchor]
+            for some in (functions, declared)
+        )
+        part = (table.matrix(mine) @ model.values(mine)) * root
         if len(named) < 4 or not part.any():
             continue
         x = dense(weighted(table.matrix(named), root))
-        (delay,) = np.linalg.lstsq(x[:, :1], part, rcond=None)[0]
-        rest = part - x[:, 0] * delay
-        moved = np.linalg.lstsq(x, part, rcond=None)[0]
-        explained = 1.0 - np.sum((part - x @ moved) ** 2) / max(rest @ rest, 1e-12)
-        out[anchor] = Level(float(delay), tuple(moved[1:].tolist()), float(explained))
+        (delay,), moved = (np.linalg.lstsq(x[:, :k], part, rcond=None)[0] for k in (1, 4))
+        left, rest = (np.sum((part - each) ** 2) for each in (x @ moved, x[:, 0] * delay))
+        share = 1.0 - float(left / max(rest, 1e-12))
+        out[anchor] = Level(float(delay), tuple(moved[1:].tolist()), share)
     return out
 
 

@@ -1,11 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Scan functions of two covariates, and functions of the time that recur.
+"""Scan functions of two covariates: products of two simple shapes, as "late while fast and high".
 
-A function of two covariates is a product of two simple shapes, as "late while fast and high". A
-function that recurs is a wave, or a pulse, of many periods. The values of a covariate are sorted
-into bins. Two sums of each bin, or of each pair of bins, give the gains of all shapes: the weights,
-and the residuals times their weights. The columns of the model are not projected out, because there
+The values of a covariate are sorted into bins. Two sums of each pair of bins give the gains of all
+products: the weights, and the residuals times their weights. The columns of the model are not projected out, because there
 are too many functions for this. So a gain is a lower bound. Separate fits score the best functions.
 """
 
@@ -13,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -33,12 +30,7 @@ COARSE, FINE = 8, 16  # bins of a covariate in the search, and around its best p
 REFINED = 6  # products that are searched again with FINE bins
 WIDEST = 0.75  # share of the bins, longest interval
 FINER = 9  # values around a knot of a product that are tried at last
-CYCLES = tuple(np.arange(1.5, 20.01, 0.1).tolist())  # numbers of periods over the range of the time
-TIME_BINS = 240
-SHORTEST = 1.0  # s, smallest range of the time
-PHASES = 24  # places in a period where a pulse begins or ends
 SINGLE = "time", "yaw", "range_rate", "range_difference"  # of no product
-FACTOR = 5  # by how much the best wave and the best pulse are searched more finely
 LEAST_GAIN = 30.0  # smallest gain, twice a log-likelihood
 FEWEST = 60  # rows of a subset
 SECOND_PENALTY = 12.0  # more than a function of one covariate, twice a log-likelihood
@@ -104,7 +96,7 @@ class _Subset:
         power, vector = (np.bincount(cell, part, m * n).reshape(m, n) for part in weighted)
         # A fit has no level of an anchor in rows with an unknown value: those of the last bin.
         known = slice(-1 if self.key[1] == "anchor" else None)
-        gains = _gain(
+        gains = gain_of_one(
             level=vector[known, known].sum(),
             power=power[known, known].sum(),
             first=x.shapes.T @ vector @ y.shapes,
@@ -117,7 +109,7 @@ class _Subset:
 
 
 class Products:
-    """Functions of two covariates, and functions of the time that recur, of the views of a table."""
+    """Functions of two covariates, of the views of a table."""
 
     def __init__(
         self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]
@@ -126,15 +118,12 @@ class Products:
 
         views : {channel: [CovariateView]}, of the rows of each channel
         """
-        self._subsets = list(_subsets(table, views))
-        of_two = [subset for subset in self._subsets if subset.key[0] in RADIO]
-        self._of_two = [(subset, _all_binned(subset)) for subset in of_two]
+        subsets = [subset for subset in _subsets(table, views) if subset.key[0] in RADIO]
+        self._subsets = [(subset, _all_binned(subset)) for subset in subsets]
         # Maps hold functions of several coordinates, and generalize better.
         self._with_maps = table.flights >= FOR_MAPS
-        pairs = sum(len(self._pairs(binned)) for _, binned in self._of_two)
-        self._price_of_two = SmoothTerm.penalty + SECOND_PENALTY + 2.0 * np.log(max(pairs, 1))
-        timed = sum("time" in subset.values for subset in self._subsets)
-        self._price_of_time = SmoothTerm.penalty + 2.0 * np.log(max(timed, 1))
+        pairs = sum(len(self._pairs(binned)) for _, binned in self._subsets)
+        self._price = SmoothTerm.penalty + SECOND_PENALTY + 2.0 * np.log(max(pairs, 1))
 
     def _pairs(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Return the pairs of covariates of which products are tried.
@@ -151,7 +140,7 @@ class Products:
         weights : (n,) of each row, 1 / variance
         """
         found = []
-        for subset, binned in self._of_two:
+        for subset, binned in self._subsets:
             weighted = subset.weighted(weights, residual)
             for pair in self._pairs(binned):
                 gain, _ = subset.best_product(weighted, [binned[name] for name in pair])
@@ -172,9 +161,6 @@ class Products:
                 if finer_gain > gain:
                     fine, gain, indices = moved, finer_gain, finer_indices
                 out.append(self._proposal(subset, fine, gain, indices, tried))
-        for subset in self._subsets:
-            if "time" in subset.values:
-                out += self._recurring(subset, weights, residual)
         return sorted(out, key=lambda one: one.price - one.gain)
 
     def _proposal(
@@ -206,133 +192,7 @@ class Products:
             factor_shape=factor_shape,
             factor_knots=factor_knots,
         )
-        return Proposal(gain, self._price_of_two + 2.0 * np.log(tried), subset.key, term)
-
-    def _recurring(
-        self, subset: _Subset, weights: np.ndarray, residual: np.ndarray
-    ) -> Iterator[Proposal]:
-        """Yield the best wave and the best pulse over the time."""
-        t = subset.values["time"]
-        low, high = map(float, np.quantile(t, [0.005, 0.995]))
-        if high - low < SHORTEST:
-            return
-        weighted = subset.weighted(weights, residual)
-
-        def sums(bins: int) -> _Sums:
-            cell = np.clip((t - low) / (high - low) * bins, 0, bins - 1).astype(np.int64)
-            power, vector = (np.bincount(cell, part, bins) for part in weighted)
-            return _Sums(power, vector, subset.prior)
-
-        coarse, fine = sums(TIME_BINS), sums(FACTOR * TIME_BINS)
-        channel, form, _ = subset.key
-        for shape, function in (("wave", _best_wave), ("pulse", _best_pulse)):
-            gain, places, tried = function(coarse, fine)
-            if gain > LEAST_GAIN:
-                knots = tuple(low + (high - low) * place for place in places)
-                term = SmoothTerm(
-                    channel=channel, covariate="time", form=form, knots=knots, shape=shape
-                )
-                price = self._price_of_time + 2.0 * np.log(tried)
-                yield Proposal(gain, price, subset.key, term)
-
-
-@dataclass(frozen=True, eq=False)
-class _Sums:
-    """Sums over bins of the time.
-
-    power, vector : (bins,) of the weights, and of the weighted residuals
-    prior : information of the prior of a coefficient
-    """
-
-    power: np.ndarray
-    vector: np.ndarray
-    prior: float
-
-    def gains_of_waves(self, cycles: tuple[float, ...]) -> np.ndarray:
-        """Return the gain of a wave of each number of periods, (c,), by least squares.
-
-        It is b' (G + prior I)^-1 b, with the Gram matrix G and the scalar products b with the
-        residual of the columns level, sine and cosine.
-        """
-        basis, squares = _waves(cycles, len(self.power))
-        gram = np.tensordot(squares, self.power, axes=(1, 0)) + self.prior * np.eye(3)
-        right = np.tensordot(basis, self.vector, axes=(1, 0))
-        return np.einsum("cj,cj->c", right, np.linalg.solve(gram, right[:, :, None])[:, :, 0])
-
-    def gains_of_pulses(
-        self, cycles: tuple[float, ...], phases: int, start: np.ndarray, length: np.ndarray
-    ) -> np.ndarray:
-        """Return the gain of each pulse of each number of periods, (c, k).
-
-        A pulse is an interval of phases, which may go on in the next period. For each number of
-        periods, the sums are folded into a period.
-
-        phases : number of phases of a period; start, length : (k,) phases
-        """
-        labels, several = _phases(cycles, len(self.power), phases), []
-        for part in (self.power, self.vector):
-            folded = np.bincount(labels, np.tile(part, len(cycles)), phases * len(cycles))
-            twice = np.tile(folded.reshape(-1, phases), 2).cumsum(axis=1)
-            upto = np.pad(twice, ((0, 0), (1, 0)))
-            several.append(upto[:, start + length] - upto[:, start])
-        inside, first = several
-        return _gain(self.vector.sum(), self.power.sum(), first, inside, inside, self.prior)
-
-
-@lru_cache(maxsize=8)
-def _waves(cycles: tuple[float, ...], bins: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a level, sine and cosine of each number of periods, (c, bins, 3), and their products.
-
-    The products are (c, bins, 3, 3).
-    """
-    phase = 2.0 * np.pi * np.array(cycles)[:, None] * (np.arange(bins) + 0.5) / bins
-    basis = np.stack([np.ones_like(phase), np.sin(phase), np.cos(phase)], axis=2)
-    return basis, basis[..., :, None] * basis[..., None, :]
-
-
-@lru_cache(maxsize=8)
-def _phases(cycles: tuple[float, ...], bins: int, phases: int) -> np.ndarray:
-    """Return the phase of each bin of the time for each number of periods, (c * bins,).
-
-    Each number of periods has `phases` labels of its own.
-    """
-    several, at = np.array(cycles)[:, None], (np.arange(bins) + 0.5) / bins
-    phase = (several * at % 1.0 * phases).astype(np.int64)
-    return (phase + phases * np.arange(len(several))[:, None]).ravel()
-
-
-def _near(cycles: float) -> tuple[float, ...]:
-    """Return numbers of periods around one of CYCLES."""
-    step = CYCLES[1] - CYCLES[0]
-    return tuple((cycles + np.linspace(-step, step, 4 * FACTOR + 1)).tolist())
-
-
-def _best_wave(coarse: _Sums, fine: _Sums) -> tuple[float, tuple[float, ...], int]:
-    """Return (gain, knots, number tried) of the best wave.
-
-    The knots are shares of the range of the time.
-    """
-    near = _near(CYCLES[int(np.argmax(coarse.gains_of_waves(CYCLES)))])
-    gains = fine.gains_of_waves(near)
-    best = int(np.argmax(gains))
-    return float(gains[best]), (0.0, 1.0 / near[best]), len(CYCLES) * FACTOR
-
-
-def _best_pulse(coarse: _Sums, fine: _Sums) -> tuple[float, tuple[float, ...], int]:
-    """Return (gain, knots, number tried) of the best pulse, as `_best_wave`."""
-    start, length = (part.ravel() for part in np.meshgrid(range(PHASES), range(2, PHASES - 1)))
-    gains = coarse.gains_of_pulses(CYCLES, PHASES, start, length)
-    row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
-    tried, near, phases = gains.size * FACTOR, _near(CYCLES[row]), FACTOR * PHASES
-    moved = np.arange(-FACTOR, FACTOR + 1)
-    start, length = (
-        part.ravel() for part in np.meshgrid(FACTOR * start[k] + moved, FACTOR * length[k] + moved)
-    )
-    gains = fine.gains_of_pulses(near, phases, start % phases, length)
-    row, k = np.unravel_index(int(np.argmax(gains)), gains.shape)
-    period = 1.0 / near[row]
-    begin, lasts = period * int(start[k] % phases) / phases, period * int(length[k]) / phases
-    return float(gains[row, k]), (begin, begin + lasts, begin + period), tried
+        return Proposal(gain, self._price + 2.0 * np.log(tried), subset.key, term)
 
 
 @dataclass(frozen=True, eq=False)
@@ -438,13 +298,13 @@ def _subsets(
             yield _Subset(key, rows + start, signs, values, line.prior_std_of("c0") ** -2)
 
 
-def _gain(
+def gain_of_one(
     level: np.ndarray,
     power: np.ndarray,
     first: np.ndarray,
     crossed: np.ndarray,
     square: np.ndarray,
-    prior: float,
+    prior: float | np.ndarray,
 ) -> np.ndarray:
     """Return the gains of a level and one column, twice a log-likelihood.
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -25,7 +26,7 @@ from uwb_tdoa_bias.effects.smooth_term import SHAPES
 from ..channels.views import CovariateView
 from .algebra import dense
 from .fit import Fit, prior_sizes, refit
-from .products import Products, Proposal
+from .products import Products, Proposal, gain_of_one
 from .table import RegressionTable
 from .terms import Candidate, Term, columns_of
 
@@ -270,21 +271,15 @@ class _Group:
         vector, own = (np.stack([product[k] for product in products]) for k in range(2))
         n, bends, waves, prior = self._bins, self._bends, self._waves, self._prior[:, None]
         level, cross = vector[:, :n].sum(axis=1)[:, None], own[:, :, :n].sum(axis=2)
-        power = cross[:, :n].sum(axis=1)[:, None] + prior
-
-        # Gain of a level and one column: least squares with the prior, in closed form.
-        def of_one(first: np.ndarray, crossed: np.ndarray, square: np.ndarray) -> np.ndarray:
-            rest = square + prior - crossed**2 / power
-            return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(
-                rest, 1e-9 * (square + prior)
-            )
+        power = cross[:, :n].sum(axis=1)[:, None]
+        of_one = partial(gain_of_one, level, power, prior=prior)
 
         # Gain of a level and two columns, as of a wave or a parabola: a 3 x 3 system.
         def of_two(first: np.ndarray, second: np.ndarray) -> np.ndarray:
             small = np.empty((len(vector), len(first), 3, 3))
             some = np.empty((len(vector), len(first), 3))
             places = first, second
-            small[..., 0, 0], some[..., 0] = power, level
+            small[..., 0, 0], some[..., 0] = power + prior, level
             for k, place in enumerate(places, start=1):
                 small[..., 0, k] = small[..., k, 0] = cross[:, place]
                 some[..., k] = vector[:, place]

@@ -88,9 +88,8 @@ class Entry:
     @property
     def levels(self) -> list[str]:
         """Return sentences on anchors that seem farther or nearer on average, by its functions."""
-        found = [pair for finding in self.findings for pair in finding.levels.items()]
-        large = [(name, one) for name, one in found if abs(one.delay) > SMALLEST_DELAY]
-        return [_level_in_words(*pair) for pair in large] if len(large) <= SHOWN else []
+        found = (pair for finding in self.findings for pair in finding.levels.items())
+        return [_level_in_words(*pair) for pair in found if abs(pair[1].delay) > SMALLEST_DELAY]
 
     @property
     def differing(self) -> str:
@@ -177,12 +176,12 @@ def without_common_part(effect: Effect, anchors: Iterable[int]) -> Effect:
 
 def _level_in_words(anchor: str, level: Level) -> str:
     """Return a sentence on the Level of an anchor."""
-    way = "farther" if level.delay > 0.0 else "nearer"
-    words = f"On average anchor {anchor} seems {abs(level.delay):.2f} m {way} than the others"
+    seems = f"{abs(level.delay):.2f} m {'farther' if level.delay > 0.0 else 'nearer'}"
+    how = "as with another antenna delay"
     if level.explained > MOVED and np.linalg.norm(level.shift) > SMALLEST_DELAY:
-        shift = ", ".join(f"{value:.2f}" for value in level.shift)
-        return f"{words}, and a move by ({shift}) m explains {level.explained:.0%} of the rest."
-    return f"{words}, as with another antenna delay."
+        move = "({:.2f}, {:.2f}, {:.2f}) m".format(*level.shift)
+        how = f"and a move by {move} explains {level.explained:.0%} of the rest"
+    return f"On average anchor {anchor} seems {seems} than the others, {how}."
 
 
 def worth_in_words(entry: Entry) -> str:
