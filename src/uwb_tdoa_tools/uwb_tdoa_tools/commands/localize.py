@@ -98,7 +98,9 @@ def _localize(args: Namespace) -> int:
         cli.show(f"{one.flight}: {first}", *(f"  {sentence}" for sentence in others))
         cli.show(f"  wrote {', '.join(path.name for path in one.written)} to {out}")
     if len(located) > 1 or named:
-        areas.draw_tracks(out / "tags.png", {one.flight: one for one in located}, named)
+        areas.draw_tracks(
+            out / "tags.png", {one.flight: (one.track, one.stays) for one in located}, named
+        )
         cli.show(f"wrote tags.png to {out}")
     cli.write_json(args.json, {"flights": [one.as_dict() for one in located]})
     return int(not all_good(located))

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
@@ -16,9 +15,6 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_picture, write_text
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_ekf.results import Odometry
-
-if TYPE_CHECKING:
-    from .localize import Located
 
 PARKED = "parked"
 LEAST = 0.2  # m beyond the edge of an area at which a tag enters or leaves it, or its deviation
@@ -175,18 +171,19 @@ def sentences(stays: Sequence[Stay]) -> Iterator[str]:
             yield f"parked at ({stay.x:.1f}, {stay.y:.1f}) m for {stay.seconds:.0f} s"
 
 
-def draw_tracks(path: Path, tags: Mapping[str, Located], areas: Areas) -> None:
-    """Draw the tracks of all tags from above, {name: Located}, with areas and parked tags."""
+def draw_tracks(path: Path, tags: Mapping[str, tuple[Track, Sequence[Stay]]], areas: Areas) -> None:
+    """Draw the tracks of all tags from above, {name: (track, stays)}, with areas and parked tags."""
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(9.0, 8.0), layout="constrained")
     ax = figure.subplots()
     for name, corners in areas.items():
         ax.fill(*corners.T, color="0.88", zorder=0)
-        ax.text(*corners.mean(axis=0), name, ha="center", color="0.4", fontsize=9)
-    for name, tag in tags.items():
-        (line,) = ax.plot(*tag.track.p.T, lw=1.0, label=name)
-        for stay in tag.stays:
+        x, y = corners.mean(axis=0).tolist()
+        ax.text(x, y, name, ha="center", color="0.4", fontsize=9)
+    for name, (track, stays) in tags.items():
+        (line,) = ax.plot(*track.p.T, lw=1.0, label=name)
+        for stay in stays:
             if stay.area == PARKED:
                 ax.plot(stay.x, stay.y, "s", ms=8, color=line.get_color())
     ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
