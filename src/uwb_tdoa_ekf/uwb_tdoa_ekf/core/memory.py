@@ -400,6 +400,7 @@ class Output(NamedTuple):
 
 # Stamps of an EKF without measurements that are -inf.
 NEVER = (
+    "shaken",
     "t",
     "first_tdoa",
     "last_tdoa",
