@@ -200,6 +200,9 @@ def test_at_rest_a_quiet_imu_does_no_harm(rate, largest):
         off = errors_of(online.odometry, flight, p)
         assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < largest
         assert nees_of(online.odometry, off) < 3.0
+        smoothed = smooth(flight.replaced(imu=quiet_imu(40.0, seed=seed)), FilterConfig())
+        off = errors_of(smoothed.odometry, flight, p)
+        assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.7 * largest
 
 
 @pytest.mark.parametrize("rate", [50.0, 400.0])

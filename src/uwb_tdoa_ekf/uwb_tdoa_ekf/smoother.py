@@ -25,11 +25,11 @@ from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
-from uwb_tdoa_bias.common.flight import Flight, Truth
+from uwb_tdoa_bias.common.flight import Flight, Imu, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
-from .core import auxiliary, horizon, noise, plane, workspace
+from .core import auxiliary, horizon, inertial, noise, plane, workspace
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
@@ -147,13 +147,21 @@ def correlation_length(flight: Flight, odometry: Odometry, effects: EffectSet) -
 
 
 def _is_alone(flight: Flight, config: FilterConfig) -> bool:
-    """Return whether a tag sends few TDOAs, and no other sensor is used."""
+    """Return whether a tag sends few TDOAs, and no other sensor is used, or an IMU that is quiet."""
     rate = len(flight.tdoa) / max(flight.duration, 1e-9)
-    imu = flight.imu if config.use_imu else None
+    imu = flight.imu if config.use_imu and not _is_quiet(flight.imu) else None
     headless = imu is None and config.initial_yaw_std > YAW_STD
     velocity = None if headless and rate < FEWEST_OF_YAW / YAW_SECONDS else flight.velocity
     measured = any(other is not None for other in (velocity, flight.range, flight.height, imu))
     return rate < horizon.BEGINS and config.adapt_noise and not measured
+
+
+def _is_quiet(imu: Imu | None) -> bool:
+    """Return whether a tag rests in the whole recording, by its inertial samples."""
+    if imu is None or not len(imu.t):
+        return True
+    turning = np.sqrt(np.mean(imu.gyro**2, axis=0)) > inertial.QUIET_GYRO
+    return not (turning | (imu.accel.std(axis=0) > inertial.QUIET_ACCEL)).any()
 
 
 def _smoothed_alone(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:

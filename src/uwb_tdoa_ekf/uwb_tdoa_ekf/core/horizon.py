@@ -439,6 +439,7 @@ def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float) -> None:
         model = ekf.horizon.models[m]
         apart = model.end - x
         covariance += weights[m] * (model.end_P + np.outer(apart, apart))
+    _doubt_height(x, covariance, ekf.extent[1, 2])
     ekf.motion_ratio, ekf.noise_ratio = power, ratio
     for h in range(HYPOTHESES):
         if hypotheses.alive(ekf.hypotheses[h]):
@@ -485,7 +486,9 @@ def smooth(
             _learn_noise(model, n, fit, prior)
     weights = np.exp(np.min(losses) - losses)
     weights /= np.sum(weights)
-    out = np.zeros(n, ODOMETRY)
+    out, top = np.zeros(n, ODOMETRY), -np.inf
+    for anchor in anchors:
+        top = max(top, anchor.position[2])
     for i in range(n):
         out[i].t = tdoas[i].t
         for m in range(count):
@@ -494,4 +497,14 @@ def smooth(
             apart = rows[m, i].x[:6] - out[i].x[:6]
             covariance = rows[m, i].covariance[:6, :6] + np.outer(apart, apart)
             out[i].covariance[:6, :6] += 0.5 * weights[m] * (covariance + covariance.T)
+        _doubt_height(out[i].x, out[i].covariance, top)
     return out
+
+
+@compiled
+def _doubt_height(x: np.ndarray, covariance: np.ndarray, top: float) -> None:
+    """Add the height of a tag above `top`, m, the highest anchor, to the standard deviation of z.
+
+    Late anchors near the ground, which these models do not know, lift a tag above all anchors.
+    """
+    covariance[2, 2] += max(0.0, x[2] - top) ** 2

@@ -205,7 +205,7 @@ def start_slowly(
     """Start the filter if few TDOAs come, from the last SLOW_TDOAS or SLOW_STAMPS.
 
     With this many TDOAs the filter starts in any case. With fewer, but at least MINIMUM, it starts
-    only if they determine a single position.
+    only if they determine a single position. A tag with a quiet IMU may stand on the ground.
 
     Parameters
     ----------
@@ -235,10 +235,21 @@ def start_slowly(
     admitted = workspace.admits(ekf.workspace, places.x[0], places.covariance[0])
     if not (enough or (share >= AGREE and admitted)):
         return
-    if np.trace(places.covariance[0, :3, :3]) > APART**2:
+    x, covariance = places.x[0].copy(), places.covariance[0].copy()
+    pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
+    known = _known_height(ekf, parameters, t)
+    log_odds = stationary_position.weigh_explanations(
+        ekf, pairs, anchors, parameters, known, x, covariance
+    )
+    rests = parameters.zero_velocity and parameters.use_imu and inertial.is_quiet(ekf.imu)
+    stands = rests and log_odds > stationary_position.DECISIVE
+    if stands:
+        stationary_position.set_at_rest(x, covariance, np.zeros((3, 3)))
+        places.x[0], places.covariance[0], places.cost[1] = x, covariance, np.inf
+    elif np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
         stationary_position.sort_places(places, ekf, parameters)
-    _start_at(ekf, parameters, t, places, False, history)
+    _start_at(ekf, parameters, t, places, stands, history)
 
 
 @compiled
