@@ -11,7 +11,7 @@ import pytest
 from uwb_tdoa_tools.cli import Output, OutputBag, OutputFile, OutputFileInFolder, OutputFolder
 
 READ = set(  # options and arguments that name inputs, or no path
-    """flights flight input bag map anchors survey effects config model peer marks distances holdout odometry beside antenna
+    """flights flight input bag map anchors areas survey effects config model peer marks distances holdout odometry beside antenna
     walls places poses coordinates static data columns seed names firmware""".split()
 )
 NUMBERS = "int", "float", "whole_number"  # names of option types

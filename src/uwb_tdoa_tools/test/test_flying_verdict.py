@@ -60,7 +60,7 @@ def made_up(
     )
     return SimpleNamespace(
         task=SimpleNamespace(seed=7, again=False, vehicle="quadrotor"),
-        flight=SimpleNamespace(truth=Truth(T, states[:, :3], states[:, 6:10])),
+        flight=SimpleNamespace(known_truth=Truth(T, states[:, :3], states[:, 6:10])),
         states=states,
         contact=np.where(height <= 0.0, 4, 0),
         odometry=odometry,
