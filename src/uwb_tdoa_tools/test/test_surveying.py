@@ -698,15 +698,16 @@ def diagnosis(late_flights):
 @pytest.mark.slow
 def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
     assert late.why_not is None and late.explained > 0.5 and late.left < LEFT
-    other = flight_with(SEVERAL_LATE, seed=102, seconds=30.0, make=all_tdoas)
-    given = EffectSet(late.found(late.shifts))
-    errors = [
-        evaluate(other, effects=effects)[0].row()["rmse_3d"] for effects in (EffectSet(), given)
-    ]
-    moved = evaluate(replace(other, anchors=late.anchors), effects=late.effects)[0].row()["rmse_3d"]
-    assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(
-        errors[1], rel=0.02
-    )  # shifts in effects.yaml give the same result as shifts in the anchors
+    given, errors = EffectSet(late.found(late.shifts)), []
+    for seed in (102, 103, 104):
+        other = flight_with(SEVERAL_LATE, seed=seed, seconds=30.0, make=all_tdoas)
+        shifted = replace(other, anchors=late.anchors)
+        cases = (other, EffectSet()), (other, given), (shifted, late.effects)
+        errors.append([evaluate(one, effects=e)[0].row()["rmse_3d"] for one, e in cases])
+    before, corrected, moved = np.mean(errors, axis=0)
+    assert corrected < 0.4 * before and corrected < 0.09
+    # shifts in effects.yaml give the same result as shifts in the anchors
+    assert moved == pytest.approx(corrected, rel=0.02)
 
 
 @pytest.mark.slow
