@@ -259,3 +259,11 @@ def test_a_tag_that_leaves_its_fixed_height_is_followed():
         smoothed = smooth(flight, HELD).odometry
         off = errors_of(smoothed, flight, p)
         assert np.sqrt(np.mean(np.sum(off**2, axis=1))) < 0.2 and nees_of(smoothed, off) < 3.0
+
+
+def test_a_known_height_above_all_anchors_is_not_doubted():
+    """Without a known height, a tag above all anchors is: late anchors near the ground lift it."""
+    high = replace(HELD, fixed_height=4.8)
+    flight, p = walk(10.0, path=lambda t: circle(t) + [0.0, 0.0, 3.6])
+    for estimate in (run_offline(flight, high), smooth(flight, high)):
+        assert (estimate.odometry.covariance[-100:, 2, 2] < 0.3**2).all()

@@ -69,6 +69,7 @@ def test_an_uncertain_tag_neither_enters_nor_leaves():
     x = [-3.0, 1.0, 1.0, -3.0]
     assert len(list(visits(track(x), {"a": SQUARE}))) == 1
     assert not list(visits(track(x, std=5.0), {"a": SQUARE}))
+    assert not list(visits(track([2.0, -3.0], std=5.0), {"a": SQUARE}))
 
 
 def test_a_visit_lasts_from_the_first_to_the_last_estimate_if_the_tag_never_was_outside():
@@ -83,6 +84,7 @@ def test_a_tag_that_stays_for_a_minute_is_parked_and_one_that_walks_is_not():
     (stay,) = parked(track(x))
     assert (stay.area, stay.x) == (PARKED, pytest.approx(40.0)) and 88.0 <= stay.seconds <= 92.0
     assert not list(parked(track(0.7 * np.arange(600.0))))
+    assert not list(parked(track(0.02 * np.arange(200.0), circle=4.0)))  # it is lost
     assert list(sentences([stay])) == ["parked at (40.0, 2.0) m for 91 s"]
 
 
@@ -95,6 +97,7 @@ def test_without_estimates_there_are_no_stays():
     [
         ("", "no areas"),
         ("dock: 3", "dock"),
+        ("parked: [[0, 0], [1, 1], [2, 0]]", "another"),
         ("dock: [[0, 0], [1, 1]]", "dock"),
         ("dock: [[0, 0], [1, 1], [2]]", "dock"),
         ("dock: [[0, 0], [1, 1], [2, .nan]]", "line 1"),

@@ -189,7 +189,9 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
     if imu_faulty != ekf.imu_faulty:
         ekf.imu_faulty = imu_faulty
         _switch(ekf, parameters, records)
-    first = ekf.imu.t == -np.inf
+    first, calm = ekf.imu.t == -np.inf, continuous and inertial.is_quiet(ekf.imu)
+    if not calm:
+        ekf.shaken = sample.t
     averaged = -np.inf < ekf.attitude_averaged_until <= sample.t
     if first and ekf.running and parameters.use_imu:
         ekf.attitude_averaged_until = sample.t + AVERAGED
@@ -200,15 +202,8 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
             initialization.level_first(ekf, parameters, records)
         if continuous and not ekf.imu_faulty:
             stationarity.detect_liftoff(ekf, sample, sample.t - ekf.imu.t, records)
-        ekf.quiet = (
-            parameters.zero_velocity
-            and continuous
-            and not ekf.imu_faulty
-            and inertial.is_quiet(ekf.imu)
-        )
+        ekf.quiet = parameters.zero_velocity and calm and not ekf.imu_faulty
         stationarity.update_zero_velocity(ekf, sample.t, records)
-    if not (continuous and inertial.is_quiet(ekf.imu)):
-        ekf.shaken = sample.t
     inertial.store(ekf.imu, sample)
 
 

@@ -105,7 +105,7 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
             at[n - 1].weight = min(at[n - 1].weight, by_innovation)
         scores[m], fit = _judge(window, steps)
         _learn_noise(model, n, fit, parameters.tdoa_std)
-    _mix(ekf, scores, parameters.tdoa_std)
+    _mix(ekf, scores, parameters.tdoa_std, max(ekf.extent[1, 2], bounds[0, 2]))
 
 
 @compiled
@@ -423,10 +423,10 @@ def _learn_noise(model: Record, n: int, fit: float, prior: float) -> None:
 
 
 @compiled
-def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float) -> None:
+def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float, top: float) -> None:
     """Set all hypotheses to the mean of the models, weighted by exp(scores), (MODELS,).
 
-    Random acceleration and noise become their means, too; tdoa_std is in m.
+    Random acceleration and noise become their means, too; tdoa_std is in m. top is that of `_doubt_height`.
     """
     weights = np.exp(scores - np.max(scores))
     weights /= np.sum(weights)
@@ -439,7 +439,7 @@ def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float) -> None:
         model = ekf.horizon.models[m]
         apart = model.end - x
         covariance += weights[m] * (model.end_P + np.outer(apart, apart))
-    _doubt_height(x, covariance, ekf.extent[1, 2])
+    _doubt_height(x, covariance, top)
     ekf.motion_ratio, ekf.noise_ratio = power, ratio
     for h in range(HYPOTHESES):
         if hypotheses.alive(ekf.hypotheses[h]):
@@ -486,7 +486,7 @@ def smooth(
             _learn_noise(model, n, fit, prior)
     weights = np.exp(np.min(losses) - losses)
     weights /= np.sum(weights)
-    out, top = np.zeros(n, ODOMETRY), -np.inf
+    out, top = np.zeros(n, ODOMETRY), bounds[0, 2]
     for anchor in anchors:
         top = max(top, anchor.position[2])
     for i in range(n):
@@ -503,7 +503,9 @@ def smooth(
 
 @compiled
 def _doubt_height(x: np.ndarray, covariance: np.ndarray, top: float) -> None:
-    """Add the height of a tag above `top`, m, the highest anchor, to the standard deviation of z.
+    """Add the height of a tag above `top`, m, to the standard deviation of z.
+
+    `top` is the height of the highest anchor, or a known height of the tag above it.
 
     Late anchors near the ground, which these models do not know, lift a tag above all anchors.
     """

@@ -236,13 +236,14 @@ def start_slowly(
     if not (enough or (share >= AGREE and admitted)):
         return
     x, covariance = places.x[0].copy(), places.covariance[0].copy()
-    pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
-    known = _known_height(ekf, parameters, t)
-    log_odds = stationary_position.weigh_explanations(
-        ekf, pairs, anchors, parameters, known, x, covariance
-    )
-    rests = parameters.zero_velocity and parameters.use_imu and inertial.is_quiet(ekf.imu)
-    stands = rests and log_odds > stationary_position.DECISIVE
+    stands = parameters.zero_velocity and parameters.use_imu and inertial.is_quiet(ekf.imu)
+    if stands:
+        pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
+        known = _known_height(ekf, parameters, t)
+        log_odds = stationary_position.weigh_explanations(
+            ekf, pairs, anchors, parameters, known, x, covariance
+        )
+        stands = log_odds > stationary_position.DECISIVE
     if stands:
         stationary_position.set_at_rest(x, covariance, np.zeros((3, 3)))
         places.x[0], places.covariance[0], places.cost[1] = x, covariance, np.inf

@@ -20,6 +20,7 @@ PARKED = "parked"
 LEAST = 0.2  # m beyond the edge of an area at which a tag enters or leaves it, or its deviation
 # s, and m about the mean position, or the circle of 95 %: a tag that stays there is parked
 LONG, NEAR = 60.0, 0.5
+UNSURE = 1.0  # m, circle of 95 % above which it is not known to be parked
 PERIOD = 0.2  # s between the estimates of a track
 
 Areas = Mapping[str, np.ndarray]  # {name: (k, 2) corners, m}
@@ -66,7 +67,7 @@ def circle_of(covariance: np.ndarray) -> np.ndarray:
 
     covariance : (n, k, k), its first two rows x and y. The sum of two squares is approximated by a
     scaled chi-squared variable of the same mean and variance (Satterthwaite, Biometrics 1946); the
-    radius is exact for a circle and for a line, and within 1 % else.
+    radius is exact for a circle and for a line, and within 0.5 % else.
     """
     plane = covariance[:, :2, :2]
     trace, square = np.einsum("nii->n", plane), np.einsum("nij,nji->n", plane, plane)
@@ -94,6 +95,8 @@ def read_areas(path: str | Path) -> Areas:
         except (TypeError, ValueError):
             areas[str(name)] = np.empty(0)
         one = areas[str(name)]
+        if str(name) == PARKED:
+            raise InputError(f"{path}: {name}: parked tags have this name; give the area another.")
         if one.ndim != 2 or one.shape[1] != 2 or len(one) < 3:
             raise InputError(
                 f"{path}: {name}: an area is a list of three or more corners [x, y] in metres, "
@@ -118,14 +121,13 @@ def visits(track: Track, areas: Areas) -> Iterator[Stay]:
     """Yield the visits to each area.
 
     A tag enters or leaves when it is beyond the edge by LEAST, or by its standard deviation where that
-    is larger: an uncertain tag changes nothing.
+    is larger: an uncertain tag changes nothing. Until it is certain, it counts as outside.
     """
     for name, corners in areas.items() if len(track.t) else ():
         inside = depth(corners, track.p)
         sure = np.abs(inside) > np.maximum(LEAST, track.std)
-        sure[0] = True
         last = np.maximum.accumulate(np.where(sure, np.arange(len(sure)), 0))
-        there = np.concatenate([[False], inside[last] > 0.0, [False]])
+        there = np.concatenate([[False], sure[last] & (inside[last] > 0.0), [False]])
         edges = np.flatnonzero(there[1:] != there[:-1])
         for first, end in zip(edges[::2].tolist(), edges[1::2].tolist()):
             yield _stay(name, track, first, end)
@@ -134,9 +136,10 @@ def visits(track: Track, areas: Areas) -> Iterator[Stay]:
 def parked(track: Track) -> Iterator[Stay]:
     """Yield the times at which the tag stayed at a place for LONG."""
     first, n = 0, len(track.t)
+    reach = np.where(track.circle > UNSURE, -1.0, np.maximum(NEAR, track.circle))
     while first < n:
         end, mean = first + 1, track.p[first]
-        while end < n and np.linalg.norm(track.p[end] - mean) <= max(NEAR, track.circle[end]):
+        while end < n and np.linalg.norm(track.p[end] - mean) <= reach[end]:
             end += 1
             mean = mean + (track.p[end - 1] - mean) / (end - first)
         if track.t[end - 1] - track.t[first] >= LONG:
@@ -155,7 +158,12 @@ def write_stays(path: Path, stays: Sequence[Stay]) -> None:
     """Write one CSV line per Stay."""
     head = ",".join(one.name for one in fields(Stay))
     lines = (
-        ",".join([f'"{stay.area}"', *(f"{value:.3f}" for value in astuple(stay)[1:])])
+        ",".join(
+            [
+                '"' + stay.area.replace('"', '""') + '"',
+                *(f"{value:.3f}" for value in astuple(stay)[1:]),
+            ]
+        )
         for stay in stays
     )
     write_text(path, "\n".join([head, *lines, ""]))
