@@ -466,19 +466,17 @@ def _by_stamp(
     What follows a fall of more than LARGEST_STEP_BACK follows: the clock of the recorder, or of the
     recorded system, was set.
     """
-    held: list[tuple[int, int, Connection, bytes]] = []
+    held: list[tuple[int, int, tuple[Connection, int, bytes]]] = []
     largest, newest = round(1e9 * LARGEST_STEP_BACK), 0
     for number, (connection, stamp, data) in enumerate(found):
         newest = max(newest, stamp)
         was_set = stamp < newest - largest
         while held and (was_set or held[0][0] < newest - largest):
-            earlier, _, of, content = heappop(held)
-            yield of, earlier, content
+            yield heappop(held)[2]
         newest = stamp if was_set else newest
-        heappush(held, (stamp, number, connection, data))
+        heappush(held, (stamp, number, (connection, stamp, data)))
     while held:
-        earlier, _, of, content = heappop(held)
-        yield of, earlier, content
+        yield heappop(held)[2]
 
 
 @contextmanager
