@@ -17,6 +17,7 @@ from .base import (
     OF_ANCHOR,
     UNLIMITED,
     ArrivalEffect,
+    DetectedEffect,
     Effect,
     GeometryEffect,
     LabelEffect,
@@ -213,11 +214,8 @@ class AnchorPosition(GeometryEffect):
         each = [tuple(f"{i}.{axis}" for axis in "xyz") for i in id_texts(anchors)]
         return [sum(each, ()), *each, *((key,) for keys in each for key in keys)]
 
-    def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
-        return {"positions": self._positions(samples.anchors)}
-
     @cached_by_anchors
-    def _positions(self, anchors: Anchors) -> np.ndarray:
+    def positions(self, anchors: Anchors) -> np.ndarray:
         positions = anchors.positions.copy()
         rows = {i: row for row, i in enumerate(id_texts(anchors))}
         for key, value in self.values.items():
@@ -228,7 +226,7 @@ class AnchorPosition(GeometryEffect):
 
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         ids, rows = samples.anchors.ids[samples.rows], samples.rows
-        to_tag = ranges(tile(samples, samples.p), self._positions(samples.anchors)[rows])[1]
+        to_tag = ranges(tile(samples, samples.p), self.positions(samples.anchors)[rows])[1]
         out = np.empty((len(samples), len(keys)))
         for column, key in enumerate(keys):
             anchor, axis = key.split(".")
@@ -323,10 +321,7 @@ class TruthFrame(GeometryEffect):
     def shown_in(self, key: str) -> tuple[str, float]:
         return ("m", 1.0) if key in "xyz" else ("degrees", math.degrees(1.0))
 
-    def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
-        return {"positions": self._positions(samples.anchors)}
-
-    def _positions(self, anchors: Anchors) -> np.ndarray:
+    def positions(self, anchors: Anchors) -> np.ndarray:
         at = np.array([self.values.get(key, 0.0) for key in AXES_AND_ANGLES])
         return anchors.positions @ rotations.Rotation.from_rotvec(at[3:]).as_matrix().T + at[:3]
 
@@ -336,18 +331,15 @@ class TruthFrame(GeometryEffect):
         )
 
     def marks(self, anchors: Anchors) -> tuple[Shift, ...]:
-        shifts = self._positions(anchors) - anchors.positions
+        shifts = self.positions(anchors) - anchors.positions
         unknown = np.full(3, np.nan)
         return tuple(Shift(int(i), by, unknown) for i, by in zip(anchors.ids, shifts))
 
 
-class SearchedDelay(ArrivalEffect):
+class SearchedDelay(DetectedEffect, ArrivalEffect):
     """Delays "i.delay" of anchors under conditions, further parameters that a detector searches."""
 
     channels = ("tdoa",)
-    portable = False
-    fitted = False
-    parameters = ()
 
     @property
     def merge_key(self) -> tuple[Hashable, ...]:

@@ -587,21 +587,30 @@ class GeometryEffect(Effect):
 
     def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
         """Return the arguments of `samples.predicted`: p (n, 3) m, or positions (N, 3) m."""
+        return {"positions": self.positions(samples.anchors)}
+
+    def positions(self, anchors: Anchors) -> np.ndarray:
+        """Return where the anchors are, (N, 3) m, of an effect that moves them."""
         raise NotImplementedError
 
     def bias(self, samples: Samples) -> np.ndarray:
         return samples.predicted(**self.antennas(samples)) - samples.predicted()
 
 
-class LabelEffect(Effect):
+class DetectedEffect(Effect):
+    """An effect of one installation or flight that a detector finds, not linear regression."""
+
+    fitted = False
+    portable = False
+    parameters: ClassVar[tuple[str, ...] | None] = ()
+
+
+class LabelEffect(DetectedEffect):
     """An effect on the ids or on the sign of TDOAs, a mistake of a driver or a survey.
 
     A rule finds it; its values are whole numbers. It is corrected before all other effects.
     """
 
-    fitted = False
-    portable = False
-    parameters = ()
     separable: ClassVar[bool] = True  # each value is meaningful without the others
     expected: ClassVar[str]  # possible values, in words
 

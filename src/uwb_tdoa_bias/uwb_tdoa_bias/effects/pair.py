@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.anchors import Anchors
 from ..common.flight import Flight
-from .base import OF_PAIR, Effect, LabelEffect, Row, listed, with_each
+from .base import OF_PAIR, DetectedEffect, Effect, LabelEffect, Row, listed, with_each
 from .samples import Samples
 
 OUTLIERS = 0.5, 5.0  # m, smallest and largest error of an injected outlier
@@ -151,7 +151,7 @@ class NoiseLevel(PairEffect):
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + noise))
 
 
-class NoiseCorrelation(Effect):
+class NoiseCorrelation(DetectedEffect):
     """The arrivals of each anchor have a first-order Gauss-Markov error.
 
     Its standard deviation is `std`, m, its correlation time is `time`, s. It cannot be corrected:
@@ -175,8 +175,6 @@ class NoiseCorrelation(Effect):
     parameters = ("std", "time")
     conditions = ("time",)
     other_units = {"time": "s"}
-    portable = False
-    fitted = False
 
     def noise_std(self, samples: Samples) -> np.ndarray:
         return np.full(len(samples), np.sqrt(2.0) * abs(self.values.get("std", 0.0)))

@@ -21,6 +21,7 @@ from .base import (
     IDENTITY,
     UNLIMITED,
     Affine,
+    DetectedEffect,
     Effect,
     Row,
     central_differences,
@@ -439,7 +440,7 @@ class BarometerDrift(Effect):
         return flight.replaced(pressure=stream.sensed(stream.values + error[:, None]))
 
 
-class IntervalEffect(Effect):
+class IntervalEffect(DetectedEffect):
     """An effect of the size "N.<part>" from "N.start" to "N.end", s after the first TDOA.
 
     N counts from 1. A limit that is not given does not apply. It acts on one stream, its only
@@ -449,9 +450,6 @@ class IntervalEffect(Effect):
     part: ClassVar[str]
     conditions = LIMITS
     other_units = dict.fromkeys(LIMITS, "s")
-    parameters = ()
-    portable = False
-    fitted = False
     usable = False
 
     def per_unit(self, samples: SensorSamples) -> np.ndarray:
