@@ -82,6 +82,11 @@ STUDIES = {  # name: (module, what it measures, page of docs/)
         "both nodes for hours: memory and lost messages",
         "notebook/reliability.md",
     ),
+    "streaming": (
+        "streaming",
+        "measured flights calibrated as one stream, piece by piece",
+        "notebook/calibration.md",
+    ),
     "surveying": (
         "surveying",
         "surveys with errors, corrected from flights alone",

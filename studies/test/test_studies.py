@@ -19,6 +19,7 @@ from studies import (
     demo,
     first_map,
     moved_anchors,
+    streaming,
     surveying,
     table,
     vehicle,
@@ -174,6 +175,13 @@ KNOWN = [  # words, module, its function that is replaced, by what, what is prin
         "drawn",
         SURVEYED,
         "| 1 of 1 | 0.100 | 0.200 | 0.150 | 0.75 (0.75) | 0 of 1 | 0.300 | 0.200 | 1.00 |",
+    ),
+    (
+        "streaming --data . --only const1 --tape 0.1",
+        streaming,
+        "drawn",
+        [(0, 0.2, 0.2, False), (0, 0.2, 0.2, True), (0, 0.2, 0.1, False), (1, 0.2, 0.21, True)],
+        "| const1 | 0.1 | 2 (1 of 1) | 0.200 | 0.100 | 0.200 | 0.210 | 1.05 |",
     ),
     (
         "calibrating --data . --only simulated",

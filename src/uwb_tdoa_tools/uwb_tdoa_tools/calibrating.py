@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from .diagnosis import diagnose, output, with_noise
 from .diagnosis.attribution import first_fit
 from .diagnosis.comparison import Baseline, compare
 from .diagnosis.noise import write_parameters
-from .diagnosis.references import GroundTruth, Nothing
+from .diagnosis.references import GroundTruth, Nothing, without_truth as without_truth_of
 from .diagnosis.report.verdict import percent, worse_phases
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from .diagnosis.self_calibration.equations import slow_innovations
@@ -39,6 +39,7 @@ from .parallel import MapFunction
 from .readers.inputs import Reading, Recording as ReadingPair
 from .scoring.metrics import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
+from .surveying.stream import PIECE
 
 RMSE = "3D RMSE"  # name of the figure with ground truth
 # smallest ratio of the slow innovations before and after, on hold-out data without ground truth
@@ -536,3 +537,11 @@ def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
     """Split a Flight at a share of its located time."""
     middle = flight.start + share * flight.duration
     return between(flight, -np.inf, middle), between(flight, middle, np.inf)
+
+
+def in_pieces(flight: Flight) -> Iterator[Flight]:
+    """Yield the pieces of PIECE s of a Flight, cut by its stamps alone, without ground truth."""
+    for number, first in enumerate(np.arange(flight.start, flight.end, PIECE).tolist()):
+        piece = without_truth_of(between(flight, first, first + PIECE))
+        if len(piece.streams) and piece.duration > 0.0:
+            yield replace(piece, name=f"{flight.name}-{number + 1}")

@@ -5,12 +5,19 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options, parallel
 from ..cli import option
+
+if TYPE_CHECKING:  # they take a second to import
+    from uwb_tdoa_bias.common.flight import Flight
+
+    from ..surveying.stream import StreamCalibration
 
 DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
 
@@ -21,6 +28,9 @@ flights, or parts of a single one. Stops at a step that fails, and prints why. A
 Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and for both nodes, and calibration.json; prints the two
 lines that start the nodes. --quick predicts within a minute what that gains, with ground truth or without, and writes nothing.
 A flight in which `check` finds an error is left out, and named with the rule; --keep uses it all the same.
+
+--stream calibrates as if the flights were heard one after the other, without their ground truth: in pieces of 45 s, each of which
+judges what the pieces before it have found. It prints a line for each piece, and writes the last calibration that was in use.
 
 Exit code: 0 calibrated, or predicted (--quick), 1 stopped, 2 bad input."""
 
@@ -38,6 +48,7 @@ def parser() -> ArgumentParser:
         "calibrate flight.log --survey anchors.yaml --holdout other.log --out calibrated/",
         "calibrate flight_bag --quick",
         "calibrate flight_bag --no-truth --quick",
+        "calibrate first_bag second_bag --stream --survey tape.yaml --std 0.1 --out calibrated/",
         "calibrate flights/ --survey anchors.yaml --without height --keep --out calibrated/",
         (
             "calibrate today_bag --no-truth --survey calibrated/anchors.yaml --effects "
@@ -63,6 +74,11 @@ def parser() -> ArgumentParser:
                 help="say within a minute what to expect of a calibration, and of more flights",
             ),
             option(
+                "--stream",
+                action="store_true",
+                help="take the flights as one stream, in pieces; ground truth is not read",
+            ),
+            option(
                 "--keep", action="store_true", help="use flights in which check finds an error, too"
             ),
             options.out(required=False),
@@ -77,12 +93,15 @@ def _calibrate(args: Namespace) -> int:
     from ..calibrating import forecast, prospect, usable_paths, with_truth, without_truth
     from ..diagnosis.noise import has_imu
     from ..estimate import FlightEstimator
+    from ..surveying.stream import StreamCalibration
 
     if not (args.out or args.quick):
         raise InputError("--out: is missing; say where to write, or ask for --quick.")
+    if args.stream:
+        options.refuse(args, ("holdout", "quick"), "--stream judges each piece by the next one")
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
-    reading = options.reading_of(args, truth=not args.no_truth)
+    reading = options.reading_of(args, truth=not (args.no_truth or args.stream))
     found, held = reading.find(args.flights), reading.find(args.holdout)
     options.check_holdout(
         (path.resolve() for path, _ in found), (path.resolve() for path, _ in held)
@@ -103,6 +122,8 @@ def _calibrate(args: Namespace) -> int:
     if all(known):
         because = "says how well anchors are known, and ground truth is there to tell"
         options.refuse(args, options.OF_TAPE, f"{because}; give --no-truth, too")
+    if args.stream:
+        return _stream(args, flights, StreamCalibration(flights[0].anchors, tape, base, config))
     if args.quick:
         with cli.Progress("calibrate") as progress:
             looking = partial(progress, "looking at a part of the flights")
@@ -139,6 +160,33 @@ def _calibrate(args: Namespace) -> int:
     cli.show(f"wrote {written} and calibration.json to {out}")
     judging = command_lines.evaluate_line(judges or paths, *files, all(known), more)
     cli.show(f"judge it:   {judging}")
+    cli.show("start the nodes with it:", *command_lines.node_lines(*files))
+    return 0
+
+
+def _stream(args: Namespace, flights: Sequence[Flight], calibration: StreamCalibration) -> int:
+    """Calibrate from flights as from one stream, write what is in use, and return the exit code."""
+    from ..calibrating import in_pieces
+    from ..diagnosis.self_calibration.solve import same_anchors
+    from ..surveying.stream import in_place
+
+    same_anchors(flights)
+    steps = []
+    for flight in flights:
+        for piece in in_pieces(flight):
+            step = calibration.take(piece)
+            cli.show(step.as_text(flight.start))
+            steps.append(step.as_dict())
+    out = args.out
+    out.mkdir(parents=True, exist_ok=True)
+    cli.write_json(out / "calibration.json", {"offered": calibration.number > 0, "steps": steps})
+    if not calibration.number:
+        return _stop("no piece has led to a calibration that the next one confirmed")
+    anchors, effects = in_place(calibration.given, calibration.effects)
+    anchors.to_yaml(out / "anchors.yaml")
+    effects.to_yaml(out / "effects.yaml")
+    cli.show(f"wrote anchors.yaml, effects.yaml and calibration.json to {out}")
+    files = out / "anchors.yaml", out / "effects.yaml"
     cli.show("start the nodes with it:", *command_lines.node_lines(*files))
     return 0
 

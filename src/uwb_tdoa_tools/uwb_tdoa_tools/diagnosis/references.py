@@ -199,6 +199,10 @@ class Nothing(Reference):
         return bool(np.mean(poses.p[inside, 2] > AIRBORNE) < FLOWN_SHARE)
 
     def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
+        if not len(poses):
+            raise InputError(
+                f"{flight.name}: its TDOAs give no estimate; record motion for longer."
+            )
         flat = replace(poses, p=poses.p * [1.0, 1.0, 0.0]) if self.on_floor(poses) else poses
         return super().span(flight, flat)
 

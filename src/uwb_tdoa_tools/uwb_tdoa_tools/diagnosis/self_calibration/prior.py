@@ -58,6 +58,7 @@ class Tape:
     trusted : anchors ("3") or coordinates ("3.z") that are known better
     trusted_std : m, of these
     unknown : ids of anchors with unknown positions
+    steady : whether no single anchor has moved or changed its delay, beyond the other deviations
     """
 
     std: float = TAPE_STD
@@ -65,6 +66,7 @@ class Tape:
     trusted: tuple[str, ...] = ()
     trusted_std: float = TRUSTED_STD
     unknown: tuple[str, ...] = ()
+    steady: bool = False
 
     def __post_init__(self) -> None:
         for name in ("std", "height_std", "trusted_std"):
@@ -124,12 +126,14 @@ class Prior:
     covariance : (4N, 4N) m^2, coordinates x, y, z anchor by anchor, then N delays
     known : (4N,) bool, parameters that the last calibration determined; ids : (N,)
     common : m, standard deviation of the common part of unknown delays
+    steady : as of Tape
     """
 
     covariance: np.ndarray
     known: np.ndarray
     ids: tuple[str, ...]
     common: float = 0.0
+    steady: bool = False
 
     @classmethod
     def of(
@@ -168,7 +172,8 @@ class Prior:
         return {
             key: change
             for key, change in changes_of(len(self.ids)).items()
-            if self.known[change[0]].all() or (unknown and (many or key[0] == POSITION))
+            if not self.steady
+            and (self.known[change[0]].all() or (unknown and (many or key[0] == POSITION)))
         }
 
     def with_delays(self, std: float) -> np.ndarray:

@@ -279,7 +279,7 @@ def self_calibrate(
     )
     spread = calibrated((tape, None))
     many = len(flights[0].anchors) > MANY
-    if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
+    if tape.unknown or tape.steady or many or not all(len(flight.tdoa) for flight in flights):
         return spread
     misfit, of_spread = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
     found: dict[ChangeKey | None, SelfCalibration] = {None: spread}
@@ -330,7 +330,7 @@ def _calibrated(
     runs = Runs([replace(flight, anchors=start) for flight in flights], base, config, constraints)
     ranged = config.use_range and any(flight.range is not None for flight in flights)  # type: ignore[attr-defined]  # as of SENSORS
     common = TAG_DELAY if ranged else 0.0
-    prior = Prior.of(given, start_std, base.covariance, common)
+    prior = replace(Prior.of(given, start_std, base.covariance, common), steady=tape.steady)
     n = len(given)
     no_delays = np.zeros(n)
     mean = np.concatenate([start.positions.ravel(), no_delays])
