@@ -39,11 +39,9 @@ from .parallel import MapFunction
 from .readers.inputs import Reading, Recording as ReadingPair
 from .scoring.metrics import NO_DIFFERENCE, change_in_words, clear_change
 from .surveying.report import as_text
-from .surveying.stream import PIECE
+from .surveying.stream import PIECE, SMALLEST_RATIO
 
 RMSE = "3D RMSE"  # name of the figure with ground truth
-# smallest ratio of the slow innovations before and after, on hold-out data without ground truth
-SMALLEST_RATIO = 1.5
 # share of the last flight that is fitted without a hold-out flight; the rest validates
 FITTED_SHARE = 2.0 / 3.0
 SECONDS = 60.0  # of a flight that are looked at

@@ -176,7 +176,7 @@ def _stream(args: Namespace, flights: Sequence[Flight], calibration: StreamCalib
         for piece in in_pieces(flight):
             step = calibration.take(piece)
             cli.show(step.as_text(flight.start))
-            steps.append(step.as_dict())
+            steps.append(cli.as_json(vars(step)))
     out = args.out
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"offered": calibration.number > 0, "steps": steps})

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -26,8 +25,9 @@ from ..diagnosis.self_calibration.prior import with_calibration
 from ..diagnosis.self_calibration.solve import LEFT, AnchorChange
 
 PIECE = 45.0  # s; a solution needs 30 s of motion
-# Smallest ratio of the slow innovations without and with the first calibration, and a changed anchor.
-RATIO = 1.5
+# Smallest ratio of the slow innovations without and with a first calibration, or a changed anchor, on
+# data that was not used
+SMALLEST_RATIO = 1.5
 MOST_WAITING = 4  # pieces with little motion that one solution joins
 
 
@@ -48,13 +48,6 @@ class Step:
     after: float
     taken: bool
     text: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON, with None for NaN."""
-        return {
-            name: None if isinstance(value, float) and np.isnan(value) else value
-            for name, value in vars(self).items()
-        }
 
     def as_text(self, origin: float) -> str:
         """Return a line; origin : s, stamp from which its times count."""
@@ -103,16 +96,19 @@ class StreamCalibration:
             effects = with_calibration(
                 self.effects, candidate.found(candidate.shifts), candidate.covariance
             )
-            after = self._slow(piece, effects)
-            why_not = candidate.why_not or self._reason_against(candidate, before, after)
+            try:
+                after = self._slow(piece, effects)
+                why_not = candidate.why_not or self._reason_against(candidate, before, after)
+            except InputError as error:  # these anchors give no estimate
+                why_not = str(error)
             text = f"not taken: {why_not}"
             if why_not is None:
                 self.effects, self._level = effects, after
                 self.number, taken = self.number + 1, True
-                changes = [change.as_text() for change in self._changes(candidate)]
+                changes = [change.as_text() for change in _changes(candidate)]
                 text = "; ".join([f"calibration {self.number} is in use", *changes])
                 break
-        changed = before > RATIO * self._level and not taken
+        changed = before > SMALLEST_RATIO * self._level and not taken
         found = self._find(piece, changed)
         return Step(piece.name, piece.start, piece.end, before, after, taken, text + found)
 
@@ -125,10 +121,12 @@ class StreamCalibration:
         self._waiting = [*self._waiting, piece][-MOST_WAITING:]
         anchors, base = in_place(self.given, self.effects)
         flights = [replace(one, anchors=anchors) for one in self._waiting]
-        first = self.effects.covariance is None
-        tapes = [self._tape] if first else [replace(self._tape, steady=True)]
-        if changed and not first:
-            tapes.insert(0, self._tape)
+        # an unknown anchor is placed once
+        tape = replace(self._tape, unknown=()) if self.number else self._tape
+        if self.effects.covariance is None:
+            tapes = [tape]
+        else:
+            tapes = [tape] * changed + [replace(tape, steady=True)]
         try:
             for tape in tapes:
                 self._candidates.append(self_calibrate(flights, tape, base, self._config))
@@ -141,10 +139,6 @@ class StreamCalibration:
         anchors, others = in_place(self.given, effects)
         return slow_innovations([replace(piece, anchors=anchors)], others, self._config)
 
-    def _changes(self, found: SelfCalibration) -> Sequence[AnchorChange]:
-        """Return the changes of single anchors since the calibration before."""
-        return () if found.base.covariance is None else found.changes
-
     def _reason_against(
         self, candidate: SelfCalibration, before: float, after: float
     ) -> str | None:
@@ -156,10 +150,15 @@ class StreamCalibration:
         fall = f"slow innovations go from {100 * before:.1f} to {100 * after:.1f} cm"
         if first and after > LEFT:
             return f"{fall}: more than {100 * LEFT:.1f} cm"
-        ratio = RATIO if first or self._changes(candidate) else 1.0
+        ratio = SMALLEST_RATIO if first or _changes(candidate) else 1.0
         if before < ratio * after:
             return fall if ratio == 1.0 else f"{fall}: by less than a factor of {ratio:g}"
         return None
+
+
+def _changes(found: SelfCalibration) -> Sequence[AnchorChange]:
+    """Return the changes of single anchors since the calibration before, if there is one."""
+    return () if found.base.covariance is None else found.changes
 
 
 def in_place(given: Anchors, effects: EffectSet) -> tuple[Anchors, EffectSet]:
