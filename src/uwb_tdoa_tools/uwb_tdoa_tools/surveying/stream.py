@@ -108,7 +108,7 @@ class StreamCalibration:
                 changes = [change.as_text() for change in _changes(candidate)]
                 text = "; ".join([f"calibration {self.number} is in use", *changes])
                 break
-        changed = before > SMALLEST_RATIO * self._level and not taken
+        changed = not taken and bool(before > SMALLEST_RATIO * self._level)
         found = self._find(piece, changed)
         return Step(piece.name, piece.start, piece.end, before, after, taken, text + found)
 
