@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """bias_node: raw TDOAs in, corrected TDOAs out.
 
-uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_static
+uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_static; on request
+/uwb/calibration (Calibration)
   -> uwb/tdoa_corrected (TdoaCorrected: one for each Tdoa), /diagnostics
   (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/bias_node.yaml.
@@ -23,7 +24,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 
-from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
+from uwb_tdoa_msgs.msg import Calibration, Tdoa, TdoaCorrected
 
 from .common.anchors import Anchors
 from .common.errors import InputError
@@ -37,10 +38,19 @@ from .correction.corrector import (
     warm_up,
 )
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED, load_network
-from .effects import EffectSet, LabelEffect
+from .effects import Effect, EffectSet, LabelEffect
+from .effects.anchor import AnchorDelay, AnchorPosition
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm
-from .ros.anchors import ANCHORS_FILE, MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
+from .ros.anchors import (
+    ANCHORS_FILE,
+    ANCHORS_QOS,
+    MOST_FRAMES,
+    AnchorsInput,
+    FramesInput,
+    of_calibration,
+    unknown_frame,
+)
 from .ros.cdr import CdrCodec, CdrTemplate
 from .ros.node import (
     FROZEN,
@@ -54,7 +64,7 @@ from .ros.node import (
     refuse_unknown,
     run,
 )
-from .ros.topics import Epoch, StreamOutput, Streams, several_publishers
+from .ros.topics import Epoch, Input, StreamOutput, Streams, several_publishers
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
@@ -84,6 +94,13 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
         0.001,
         100.0,
     ),
+    "calibrated": Parameter(
+        False,
+        (
+            "take positions and delays of anchors from /uwb/calibration, as calibration_node finds "
+            "them, in the place of those of effects_file"
+        ),
+    ),
     "body_frame": Parameter(
         "base_link",
         (
@@ -95,6 +112,7 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
 }
 POSE = "pose", "twist"  # fields read of an Odometry: numbers
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # fields read of a Tdoa
+CALIBRATION = "/uwb/calibration"  # of all tags of an installation
 CORRECTED = (  # fields written of a TdoaCorrected
     "anchor_a",
     "anchor_b",
@@ -133,6 +151,19 @@ class Antenna:
     heard: int = 0
 
 
+def with_anchors_of(effects: EffectSet, found: Collection[Effect] = ()) -> EffectSet:
+    """Return an EffectSet that begins with positions and delays of anchors, for a calibration.
+
+    found : effects that replace its own; without any it keeps them, or gets such of 0
+    """
+    of_anchors = {
+        kind.name: next((one for one in (*found, *effects) if one.name == kind.name), kind())
+        for kind in (AnchorPosition, AnchorDelay)
+    }
+    others = [one for one in effects if one.name not in of_anchors]
+    return EffectSet((*of_anchors.values(), *others), effects.covariance)
+
+
 class BiasNode(StreamNode):
     """Node around a Corrector: converts messages and counts them.
 
@@ -155,7 +186,20 @@ class BiasNode(StreamNode):
         refuse_unknown(self, member or ())
         effects_file, model_file = own["effects_file"], own["model_file"]
         self._lag, self._limit, self._body = own["pose_lag"], own["hold"], own["body_frame"]
-        self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
+        effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
+        self._calibrations: Input | None = None
+        self._calibration = 0  # number of the one in use
+        if own["calibrated"]:
+            if own["frozen"]:
+                raise InputError(
+                    "calibrated: changes the correction while the node runs, and frozen forbids that; "
+                    "leave one of them out."
+                )
+            effects = with_anchors_of(effects)  # they are compiled now
+            self._calibrations = Input(
+                self, Calibration, CALIBRATION, self._on_calibration, ANCHORS_QOS
+            )
+        self._effects = effects
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = [one for one in self._effects if isinstance(one, LabelEffect)]
         self._model = load_network(model_file)
@@ -234,6 +278,24 @@ class BiasNode(StreamNode):
             else:
                 antenna.corrector.change_anchors(anchors)
         self._release()
+
+    def _on_calibration(self, message: Calibration) -> None:
+        """Replace positions and delays of the anchors in the effects of all antennas."""
+        anchors = self._anchors.anchors
+        try:
+            found = of_calibration(message)
+            if anchors is not None and message.header.frame_id != anchors.frame:
+                raise InputError(
+                    f"it is in frame '{message.header.frame_id}', the anchors in '{anchors.frame}'."
+                )
+        except InputError as error:
+            self.warn_at_times(CALIBRATION, f"{CALIBRATION}: not taken: {error}")
+            return
+        self._calibration, self._effects = message.number, with_anchors_of(self._effects, found)
+        for antenna in self._all_antennas:
+            antenna.effects = with_anchors_of(antenna.effects, found)
+            if antenna.corrector is not None:
+                antenna.corrector.change_effects(antenna.effects)
 
     def _on_frames(self) -> None:
         """Update all antennas after a new or changed constant transform."""
@@ -452,6 +514,7 @@ class BiasNode(StreamNode):
         self._reported = counts.copy()
         recent = {"uwb/tdoa": new["received"], "odometry": new["poses"]}
         others = [*self._anchors.refusals, *self._frames.refusals]
+        others += [self._calibrations.refusals] if self._calibrations else []
         wiring = [
             *(end.trouble(recent[name]) for name, end in inputs.items()),
             several_publishers(self, "uwb/tdoa_corrected"),
@@ -462,6 +525,7 @@ class BiasNode(StreamNode):
         outside = [phrase for one in correctors if one is not None for phrase in one.outside]
         values = {
             "model": self._model_name,
+            "calibration": self._calibration,
             "received": counts["received"],
             "published": counts["published"],
             "waiting": len(self._hold) + len(self._tdoas),

@@ -540,6 +540,16 @@ def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
 def in_pieces(flight: Flight) -> Iterator[Flight]:
     """Yield the pieces of PIECE s of a Flight, cut by its stamps alone, without ground truth."""
     for number, first in enumerate(np.arange(flight.start, flight.end, PIECE).tolist()):
-        piece = without_truth_of(between(flight, first, first + PIECE))
-        if len(piece.streams) and piece.duration > 0.0:
-            yield replace(piece, name=f"{flight.name}-{number + 1}")
+        if (piece := cut(flight, number, first)) is not None:
+            yield piece
+
+
+def cut(flight: Flight, number: int, first: float) -> Flight | None:
+    """Return PIECE s of a Flight from a stamp, s, without ground truth; None without TDOAs.
+
+    number : of the piece, from 0, for its name
+    """
+    piece = without_truth_of(between(flight, first, first + PIECE))
+    if not len(piece.streams) or not piece.duration > 0.0:
+        return None
+    return replace(piece, name=f"{flight.name}-{number + 1}")

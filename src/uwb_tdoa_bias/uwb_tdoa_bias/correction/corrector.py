@@ -94,11 +94,15 @@ class Corrector:
         lag : s
         poses : Poses that other Correctors use, too; by default its own
         """
-        self.anchors = anchors
-        effects = EffectSet() if effects is None else effects
+        self.anchors, self.model, self.lag = anchors, model, lag
+        self._set_effects(EffectSet() if effects is None else effects)
+        self._poses = Poses() if poses is None else poses
+        self._begin()
+
+    def _set_effects(self, effects: EffectSet) -> None:
+        model = self.model
         self.effects = effects.where(lambda effect: not effect.is_hypothesis)
         self.left_to_filter = effects.where(lambda effect: effect.is_hypothesis)
-        self.model = model
         held = model.holds if model else ()
         twice = set(held) & {effect.label for effect in self.effects}
         if twice:
@@ -106,7 +110,6 @@ class Corrector:
                 f"effects: {min(twice)} is in the model too, which holds {', '.join(held)}; leave "
                 "it out of the effects."
             )
-        self.lag = lag
         own = self.effects.name if len(self.effects) else ""
         self.model_name = _joined(own, model.name if model else "")
         of_effects = _joined(own, model.of_effects if model else "")
@@ -116,8 +119,6 @@ class Corrector:
             NETWORK: self.model_name,
             FADED: self.model_name,
         }
-        self._poses = Poses() if poses is None else poses
-        self._begin()
 
     def reset(self) -> None:
         """Delete all poses."""
@@ -135,6 +136,11 @@ class Corrector:
     def change_anchors(self, anchors: Anchors) -> None:
         """Continue with other Anchors and the known poses."""
         self.anchors, self._latest_samples, self._last_tdoa = anchors, None, None
+
+    def change_effects(self, effects: EffectSet) -> None:
+        """Continue with another EffectSet and the known poses. Raises InputError as at the start."""
+        self._set_effects(effects)
+        self._latest_samples = None
 
     @property
     def idle(self) -> bool:

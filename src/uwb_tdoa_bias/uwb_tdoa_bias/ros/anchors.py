@@ -17,12 +17,14 @@ from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo, SubscriptionEve
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_msgs.msg import Anchor, AnchorArray
+from uwb_tdoa_msgs.msg import Anchor, AnchorArray, Calibration
 
 from ..common.anchors import MOST_NAMED, SAME_PLACE, Anchors, refuse_faulty
 from ..common.errors import InputError
 from ..common.survey import read_survey
 from ..common.transforms import Frames
+from ..effects import EffectSet
+from ..effects.anchor import AnchorDelay, AnchorPosition
 from .node import MOST_QUOTED, Parameter, StreamNode
 from .topics import Input, Refusals, publishers_of
 
@@ -88,6 +90,42 @@ def in_words(before: Anchors, after: Anchors) -> str:
     return "; ".join(
         [*parts, f"going on with the {stay.sum()} that stay" if stay.any() else "starting over"]
     )
+
+
+def calibration_to_message(effects: EffectSet, anchors: Anchors) -> Calibration:
+    """Return a Calibration with the positions, delays and covariance of an EffectSet."""
+    keys = [(AnchorPosition.name, f"{i}.{axis}") for i in anchors.ids.tolist() for axis in "xyz"]
+    keys += [(AnchorDelay.name, str(i)) for i in anchors.ids.tolist()]
+    values = {(one.name, key): value for one in effects for key, value in one.values.items()}
+    numbers = [values.get(key, 0.0) for key in keys]
+    message = Calibration(
+        ids=anchors.ids.tolist(),
+        shifts=numbers[: 3 * len(anchors)],
+        delays=numbers[3 * len(anchors) :],
+    )
+    message.header.frame_id = anchors.frame
+    if effects.covariance is not None:
+        held, matrix = effects.covariance.of(keys)
+        if len(held) == len(keys):
+            message.covariance = matrix.ravel().tolist()
+    return message
+
+
+def of_calibration(message: Calibration) -> tuple[AnchorPosition, AnchorDelay]:
+    """Return the effects that a Calibration states; raise InputError if it is faulty."""
+    ids, numbers = message.ids.tolist(), [*message.shifts, *message.delays]
+    if len(numbers) != 4 * len(ids) or len(message.shifts) != 3 * len(ids):
+        raise InputError(
+            f"{len(message.shifts)} shifts and {len(message.delays)} delays are no three and one "
+            f"for each of {len(ids)} anchors."
+        )
+    shifts = {
+        f"{i}.{axis}": value
+        for i, of_anchor in zip(ids, np.reshape(message.shifts, (-1, 3)).tolist())
+        for axis, value in zip("xyz", of_anchor)
+    }
+    delays = dict(zip(map(str, ids), message.delays.tolist()))
+    return AnchorPosition(values=shifts), AnchorDelay(values=delays)
 
 
 class AnchorsInput:

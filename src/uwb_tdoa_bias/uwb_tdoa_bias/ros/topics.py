@@ -251,11 +251,7 @@ class StreamInput:
 
         Each entry holds successive messages of one frame; codec : CdrCodec
         """
-        messages, stamps = [], []
-        for data, information in waiting(self._subscription):
-            messages.append(data)
-            stamps.append(information["received_timestamp"] or time.time_ns())
-            self._count_lost(information["publication_sequence_number"])
+        messages, stamps = self.fetch_serialized()
         if not messages:
             return []
         arrivals = 1e-9 * np.array(stamps)
@@ -263,6 +259,15 @@ class StreamInput:
             (frame, rows, arrivals[some])
             for frame, rows, some in codec.read(messages, self.refusals.add)
         ]
+
+    def fetch_serialized(self) -> tuple[list[bytes], list[int]]:
+        """Return the arrived messages, and their arrivals, ns since 1970."""
+        messages, stamps = [], []
+        for data, information in waiting(self._subscription):
+            messages.append(data)
+            stamps.append(information["received_timestamp"] or time.time_ns())
+            self._count_lost(information["publication_sequence_number"])
+        return messages, stamps
 
     def _count_lost(self, number: int | None) -> None:
         """Count the messages missing before `number`; None from a middleware without numbers.
