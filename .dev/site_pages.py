@@ -32,7 +32,7 @@ PAGES = {  # {file at the top of the repository: its page}
 }
 NO_NAVIGATION = "---\nhide:\n  - navigation\n---\n"  # beside the text: the first page has none
 NODES = ("bias_node", "ekf_node", "localization_node", "anchors_node", "debias_node")
-NODES += ("autopilot_node", "vehicle_node")
+NODES += ("autopilot_node", "calibration_node", "vehicle_node")
 # code, where nothing is a link; or the indent of a line; or the end of a link, with its text if that is the name of a page
 PART = re.compile(
     r"(^```.*?^```$|`[^`\n]*`)|(^ +(?=\S))|(\[\w+\.md)?\]\(([^)\s:]+)\)", re.MULTILINE | re.DOTALL

@@ -38,6 +38,7 @@ setup(
         "console_scripts": [
             "autopilot_node = uwb_tdoa_tools.executables:autopilot_node",
             "calibrate = uwb_tdoa_tools.executables:calibrate",
+            "calibration_node = uwb_tdoa_tools.executables:calibration_node",
             "check = uwb_tdoa_tools.executables:check",
             "convert = uwb_tdoa_tools.executables:convert",
             "debias = uwb_tdoa_tools.executables:debias",

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 from collections import Counter
+import math
 from pathlib import Path
 import time
 
@@ -18,9 +19,13 @@ from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.correction.model import NETWORK, Model  # noqa: E402
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
+from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet  # noqa: E402
+from uwb_tdoa_bias.effects.anchor import AnchorPosition  # noqa: E402
+from uwb_tdoa_bias.effects.tag import TagLeverArm  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import calibration_to_message  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_bias.ros.node import BURST  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
@@ -91,6 +96,80 @@ def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_d
         ("right", 0.6),
     }
     assert [frame for frame, _ in sent] == [("left", "right")[k % 2] for k in range(len(sent))]
+
+
+@pytest.fixture
+def calibrated(tmp_path):
+    """A BiasNode that takes calibrations, with a delay of anchor 1 in its effects_file."""
+    known = EffectSet((AnchorDelay(values={"1": 0.5}), TagLeverArm(values={"x": 0.1})))
+    known.to_yaml(tmp_path / "effects.yaml")
+    given = ["calibrated:=true", f"effects_file:={tmp_path / 'effects.yaml'}"]
+    rclpy.init(args=["--ros-args", *(word for each in given for word in ("-p", each))])
+    node = BiasNode()
+    yield node
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+def bias_of(node, k=0, frame="base_link"):
+    """Return the bias of a TDOA of anchors 0 and 1 at the origin, at 0.01 k s."""
+    t = 0.01 * k
+    node._known_poses.add(t, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3), 0.0)
+    stamps, rows = np.array([t]), np.array([0])
+    return node._antenna(frame).corrector.correct(stamps, rows, rows + 1, np.zeros(1)).bias[0]
+
+
+def test_a_calibration_replaces_what_the_file_says_of_anchors_and_keeps_the_poses(calibrated):
+    frames, anchors = calibrated._frames.frames, Anchors.from_positions([[-9.0, 0, 0], [9.0, 0, 0]])
+    calibrated._anchors.anchors = anchors
+    calibrated._on_anchors(anchors)
+    for k in range(100):
+        before = bias_of(calibrated, k)
+    assert before == pytest.approx(0.5 - 0.2)
+    found = AnchorPosition(values={"0.x": -0.2}), AnchorDelay(values={"0": 0.1, "1": 0.3})
+    message = calibration_to_message(EffectSet(found), anchors)
+    message.number = 7
+    calibrated._on_calibration(message)
+    # |p - b| - |p - a| falls by the 0.2 m that anchor 0 is farther away
+    assert bias_of(calibrated, 101) == pytest.approx(0.3 - 0.1 - 0.2 - 0.2)
+    assert calibrated._report()[2]["calibration"] == 7
+    frames.set("base_link", "mast", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1))
+    assert bias_of(calibrated, 102, "mast") == pytest.approx(bias_of(calibrated, 102))
+
+
+@pytest.mark.parametrize(
+    "fault, why",
+    [
+        ({"shifts": [0.0]}, "1 shifts and 2 delays are no three and one for each of 2 anchors"),
+        ({"delays": [0.0, math.nan]}, "nan"),
+        ({"shifts": [9.0] * 6}, "9"),
+        ({"ids": [0, 0]}, "twice"),
+    ],
+)
+def test_a_faulty_calibration_changes_nothing(calibrated, monkeypatch, fault, why):
+    anchors = Anchors.from_positions([[-9.0, 0, 0], [9.0, 0, 0]])
+    calibrated._anchors.anchors = anchors
+    calibrated._on_anchors(anchors)
+    said = []
+    monkeypatch.setattr(BiasNode, "warn_at_times", lambda node, kind, text: said.append(text))
+    before, message = calibrated._effects, calibration_to_message(EffectSet(), anchors)
+    for name, value in fault.items():
+        setattr(message, name, value)
+    calibrated._on_calibration(message)
+    message = calibration_to_message(EffectSet(), anchors)
+    message.header.frame_id = "other"
+    calibrated._on_calibration(message)
+    assert calibrated._effects is before
+    assert why in said[0] and "frame 'other', the anchors in 'map'" in said[1]
+
+
+def test_frozen_refuses_to_be_calibrated():
+    rclpy.init(args=["--ros-args", "-p", "frozen:=true", "-p", "calibrated:=true"])
+    try:
+        with pytest.raises(InputError, match="calibrated: .* frozen forbids"):
+            BiasNode()
+    finally:
+        rclpy.shutdown()
 
 
 def test_an_effect_that_needs_orientations_of_anchors_is_named_where_there_are_none(node):

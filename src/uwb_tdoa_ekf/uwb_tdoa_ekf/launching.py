@@ -35,9 +35,21 @@ NODES = {  # {executable: (package, names of its parameters)}
     "bias_node": ("uwb_tdoa_bias", {*bias_node.PARAMETERS} | EVERYWHERE),
     "ekf_node": ("uwb_tdoa_ekf", names_of_parameters() | EVERYWHERE),
     "debias_node": ("uwb_tdoa_ekf", {*debias_node.PARAMETERS} | EVERYWHERE),
+    "calibration_node": (
+        "uwb_tdoa_tools",  # below this package: test_calibration_node.py compares the names
+        {"anchors_file", "effects_file", "ekf_params", "tape_std", "trusted", "calibration_folder"}
+        | EVERYWHERE,
+    ),
     "anchors_node": ("uwb_tdoa_bias", {*anchors_node.PARAMETERS} | EVERYWHERE),
 }
-PATHS = "anchors_file", "effects_file", "map", "flyable_volume"  # parameters that are paths
+PATHS = (  # parameters that are paths
+    "anchors_file",
+    "effects_file",
+    "map",
+    "flyable_volume",
+    "calibration_folder",
+    "ekf_params",
+)
 OF_FILES = {"params_file"}  # a parameter file for both nodes of a tag; launch arguments override it
 RESPAWN = {  # launch arguments: (default, text, choices)
     "respawn": (
@@ -87,6 +99,8 @@ OF_A_TAG = {
     "effects_file": "effects.yaml that diagnose wrote",
     "model_file": "ONNX bias model",
     "map": "map.npz that debias wrote; starts debias_node",
+    "calibrated": "true: calibrate the anchors while the tag moves; starts calibration_node",
+    "calibration_folder": "folder in which calibrations are kept, and from which the next start takes one",
     "world_frame": "frame of the odometry",
     "body_frame": "frame of the robot",
     "publish_tf": "none, base (map -> base_link) or odom (map -> odom, REP 105)",
@@ -95,6 +109,11 @@ OF_A_TAG = {
     "frozen": FROZEN,
 }
 OF_ALL_TAGS = {name: OF_A_TAG[name] for name in ("use_sim_time", "frozen")}
+PARAMETER_FILES = {  # {node: launch argument}
+    "bias_node": "bias_params",
+    "ekf_node": "ekf_params",
+    "calibration_node": "calibration_params",
+}
 AUTO = "auto"  # value of `processes`: one process for each core
 # s until a node is started again after a crash; doubled each time
 FIRST, LONGEST = (1.0, 30.0)
@@ -284,7 +303,9 @@ def tag(
     files: dict | None = None,
     log_level: str = "info",
 ) -> list[Start]:
-    """Return the Starts of bias_node and ekf_node of one tag; with a `map`, of debias_node too.
+    """Return the Starts of bias_node and ekf_node of one tag.
+
+    With a `map`, of debias_node, too; with `calibrated`, of calibration_node, too.
 
     Parameters
     ----------
@@ -302,8 +323,9 @@ def tag(
     InputError
         If no node has one of the parameters.
     """
-    refuse_unknown(values, "bias_node", "ekf_node", "debias_node")
+    refuse_unknown(values, "bias_node", "ekf_node", "debias_node", "calibration_node")
     nodes = ["bias_node", "ekf_node"] + ["debias_node"] * bool(values.get("map"))
+    nodes += ["calibration_node"] * bool(values.get("calibrated"))
     return [
         start(name, namespace, values, (files or {}).get(name, ()), log_level) for name in nodes
     ]
@@ -314,7 +336,8 @@ def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "
 
     The file has the form `tags: {NAMESPACE: {parameter: value, remaps: {topic: name}}}`. Keys next
     to `tags` hold for all tags. Each tag has its own body frame NAMESPACE/base_link, unless the file
-    names another. If all tags name the same anchors_file, one anchors_node starts too.
+    names another. If all tags name the same anchors_file, one anchors_node starts too. Of all
+    tags that are `calibrated`, the first has a calibration_node, which serves all.
 
     Parameters
     ----------
@@ -353,6 +376,8 @@ def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         starts += [replace(each, remaps=remaps) for each in nodes]
+    others = [each for each in starts if each.executable == "calibration_node"][1:]
+    starts = [each for each in starts if each not in others]
     anchors = {node.parameters[-1].get("anchors_file") for node in starts if node.parameters} - {
         None
     }
@@ -487,11 +512,9 @@ def _one_tag(given: Mapping[str, str]) -> list[Start]:
     """Return the Starts of tdoa.launch.py."""
     values = typed({name: given[name] for name in OF_A_TAG})
     namespace, log_level = given["namespace"], given["log_level"]
-    files = {
-        node: [given[key]]
-        for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params"))
-        if given[key]
-    }
+    files = {node: [given[key]] for node, key in PARAMETER_FILES.items() if given[key]}
+    if given["ekf_params"]:
+        values["ekf_params"] = given["ekf_params"]
     starts = tag(namespace, values, files, log_level)
     if "anchors_file" in values:
         starts.append(start("anchors_node", namespace, values, (), log_level))
@@ -526,6 +549,11 @@ LAUNCH_FILES = {
             "namespace": ("", "one per tag; the topics are relative to it", None),
             "bias_params": ("", "parameter file of bias_node, overridden by the above", None),
             "ekf_params": ("", "parameter file of ekf_node, overridden by the above", None),
+            "calibration_params": (
+                "",
+                "parameter file of calibration_node, overridden by the above",
+                None,
+            ),
             **COMMON,
         },
         _one_tag,

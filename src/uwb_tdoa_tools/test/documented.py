@@ -19,6 +19,7 @@ NODES = {
     "anchors_node": "uwb_tdoa_bias.anchors_node",
     "autopilot_node": "uwb_tdoa_tools.autopilot_node",
     "bias_node": "uwb_tdoa_bias.bias_node",
+    "calibration_node": "uwb_tdoa_tools.calibration_node",
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
     "localization_node": "uwb_tdoa_ekf.localization_node",

@@ -33,6 +33,7 @@ ROS = """
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
     uwb_tdoa_ekf.monitoring.health
     uwb_tdoa_tools.autopilot.crazyflie uwb_tdoa_tools.autopilot_node
+    uwb_tdoa_tools.calibration_node
     uwb_tdoa_tools.live.replay uwb_tdoa_tools.live.session
     uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.vehicle_node
 """.split()

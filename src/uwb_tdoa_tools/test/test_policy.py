@@ -22,11 +22,13 @@ from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_ekf.localization_node import LocalizationNode  # noqa: E402
 from uwb_tdoa_tools.autopilot_node import AutopilotNode  # noqa: E402
+from uwb_tdoa_tools.calibration_node import CalibrationNode  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import VehicleNode  # noqa: E402
 
 FILE = Path(__file__).resolve().parents[2] / "uwb_tdoa_ekf" / "sros2" / "policy.xml"
 ROLES = ("topic", "publish"), ("topic", "subscribe"), ("service", "reply"), ("service", "request")
-NODES = BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode, AutopilotNode, VehicleNode
+NODES = BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode
+NODES += AutopilotNode, CalibrationNode, VehicleNode
 KINDS = {kind.NAME: kind for kind in NODES}
 OTHERS = {"robot", "operator"}  # enclaves of other nodes
 
@@ -62,9 +64,10 @@ def arguments(tmp_path):
             "-p",
             "log:=[tdoa, imu, height, pressure]",
         ],
+        "bias_node": ["-p", "calibrated:=true"],
         "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
         "ekf_node": ["-p", "publish_tf:=odom"],
-        "localization_node": ["-p", "publish_tf:=odom"],
+        "localization_node": ["-p", "publish_tf:=odom", "-p", "calibrated:=true"],
         "vehicle_node": [
             "-p",
             "simulated_time:=true",

@@ -73,7 +73,7 @@ PARAMETERS = {  # in the order of config/calibration_node.yaml
             '[""] for none'
         ),
     ),
-    "folder": Parameter(
+    "calibration_folder": Parameter(
         "",
         (
             "folder in which the last calibrations are kept, and from which the newest is taken at the "
@@ -99,7 +99,8 @@ class CalibrationNode(StreamNode):
         self._base = EffectSet.from_yaml(effects) if effects else EffectSet()
         self._config = FilterConfig.from_yaml(config) if config else None
         self._tape = Tape(own["tape_std"], trusted=tuple(filter(None, own["trusted"])))
-        self._folder = Path(own["folder"]) if own["folder"] else None
+        folder = own["calibration_folder"]
+        self._folder = Path(folder) if folder else None
         self._cutter, self._frames = PieceCutter(), list[bytes]()
         self._pieces: list[Piece] = []  # that wait
         self._worker: Worker | None = None
@@ -231,7 +232,9 @@ class CalibrationNode(StreamNode):
             try:
                 keep(self._folder, self._number, anchors, self._found)
             except (OSError, InputError) as error:
-                self._trouble = f"folder: calibration {self._number} is not kept: {error}"
+                self._trouble = (
+                    f"calibration_folder: calibration {self._number} is not kept: {error}"
+                )
 
     def _report(self) -> Report:
         new = self._counts - self._reported

@@ -119,6 +119,8 @@ def of_calibration(message: Calibration) -> tuple[AnchorPosition, AnchorDelay]:
             f"{len(message.shifts)} shifts and {len(message.delays)} delays are no three and one "
             f"for each of {len(ids)} anchors."
         )
+    if len(set(ids)) < len(ids):
+        raise InputError(f"ids: {max(ids, key=ids.count)} is there twice.")
     shifts = {
         f"{i}.{axis}": value
         for i, of_anchor in zip(ids, np.reshape(message.shifts, (-1, 3)).tolist())
