@@ -20,11 +20,12 @@ import yaml
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from programs import start  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.common.survey import read_survey  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
@@ -35,7 +36,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.calibrating import in_pieces  # noqa: E402
 from uwb_tdoa_tools.calibration_node import PARAMETERS, CalibrationNode  # noqa: E402
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape  # noqa: E402
-from uwb_tdoa_tools.surveying.pieces import last_kept  # noqa: E402
+from uwb_tdoa_tools.surveying.pieces import keep, last_kept  # noqa: E402
 from uwb_tdoa_tools.surveying.stream import PIECE, StreamCalibration  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "calibration_node.yaml"
@@ -69,6 +70,32 @@ def test_what_cannot_be_meant_is_refused(given, why):
         with pytest.raises(InputError, match=re.escape(why)):
             CalibrationNode()
     finally:
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize(
+    "given, why",
+    [
+        ("trusted:=['77']", "there is no anchor '77'"),
+        (
+            "calibration_folder:={}",
+            "is of anchors 0, 1, 2 in frame 'map', the survey of 0, 1, 2, 3",
+        ),
+    ],
+)
+def test_anchors_that_cannot_be_calibrated_are_an_error_and_end_nothing(tmp_path, given, why):
+    few, all_of = (Anchors.from_positions(np.eye(4, 3)[:count]) for count in (3, 4))
+    keep(tmp_path, 1, few, EffectSet())
+    rclpy.init(args=["--ros-args", "-p", given.format(tmp_path)])
+    node = CalibrationNode()
+    try:
+        node._anchors.anchors = all_of
+        node._on_anchors(all_of)
+        level, text, _ = node._report()
+        assert level == DiagnosticStatus.ERROR and why in text
+        assert not node._target.number and list(node._target.ids) == [0, 1, 2, 3]
+    finally:
+        node.destroy_node()
         rclpy.shutdown()
 
 

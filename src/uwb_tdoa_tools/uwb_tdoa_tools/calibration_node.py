@@ -107,6 +107,7 @@ class CalibrationNode(StreamNode):
         self._counts: Counter[str] = Counter()
         self._reported: Counter[str] = Counter()  # at the last report
         self._text, self._trouble = "no piece is complete yet", ""
+        self._refused = ""  # why these anchors are not calibrated
         self._cost = 0.0  # s of processor time of the last piece
         self._found = self._base  # calibration in use, of this number
         self._number, self._last, self._in_use = 0, 0.0, True
@@ -131,10 +132,15 @@ class CalibrationNode(StreamNode):
     def _on_anchors(self, anchors: Anchors) -> None:
         """Start with Anchors, from the last calibration of them that was kept."""
         self._end_worker()
-        self._cutter, self._pieces = PieceCutter(), []
+        self._cutter, self._pieces, self._refused = PieceCutter(), [], ""
         self._number, self._found, age = 0, self._base, 0.0
-        if self._folder is not None:
-            self._number, self._found, age = last_kept(self._folder, anchors, self._base)
+        try:
+            self._tape.position_std(anchors)  # refuses unknown ids in `trusted`
+            if self._folder is not None:
+                self._number, self._found, age = last_kept(self._folder, anchors, self._base)
+        except InputError as error:
+            self._refused = f"not calibrating: {error}"
+            self.get_logger().error(self._refused)
         if self._number:
             self._text = f"calibration {self._number} is in use, kept {age / 3600.0:.1f} h ago"
             self.get_logger().info(self._text)
@@ -192,15 +198,15 @@ class CalibrationNode(StreamNode):
             for content, stamp in zip(messages, stamps):
                 self._cutter.add(topic, stamp, content)
         self._pieces += self._cutter.pieces()
+        left_out, self._pieces = self._pieces[:-MOST_WAITING], self._pieces[-MOST_WAITING:]
+        self._counts["left out"] += len(left_out)
         anchors = self._anchors.anchors
-        if anchors is not None:
+        if anchors is not None and not self._refused:
             self._serve(anchors)
         return arrived
 
     def _serve(self, anchors: Anchors) -> None:
         """Give the next piece to the Worker, and use what it has found."""
-        left_out, self._pieces = self._pieces[:-MOST_WAITING], self._pieces[-MOST_WAITING:]
-        self._counts["left out"] += len(left_out)
         try:
             taken = self._worker and self._worker.result()
             if taken:
@@ -262,6 +268,8 @@ class CalibrationNode(StreamNode):
             trouble = (
                 trouble or "no bias_node takes the calibration: start it with calibrated:=true"
             )
+        if self._refused:
+            return DiagnosticStatus.ERROR, self._refused, values
         if trouble:
             return DiagnosticStatus.WARN, trouble, values
         return DiagnosticStatus.OK, self._text, values
