@@ -45,7 +45,6 @@ from uwb_tdoa_bias.ros.node import (
     Parameter,
     Report,
     StreamNode,
-    StreamPoller,
     declare_all,
     refuse_unknown,
     run,
@@ -82,6 +81,7 @@ PARAMETERS = {  # in the order of config/calibration_node.yaml
     ),
 }
 HAND_OVER, STEP = 5.0, 0.25  # s, of a new calibration, and between the messages of it
+REST = 0.05  # s between two turns: nobody waits for this node
 MOST_WAITING = 2  # pieces that wait for the process
 
 
@@ -89,6 +89,7 @@ class CalibrationNode(StreamNode):
     """Cut what it hears into pieces, and publish what a Worker finds from them."""
 
     NAME = "calibration_node"
+    PERIOD = REST
 
     def __init__(self) -> None:
         """Declare parameters, and connect all topics."""
@@ -123,7 +124,7 @@ class CalibrationNode(StreamNode):
         self.create_timer(STEP, self._hand_over, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._diagnostics = Diagnostics(self, self._report)
         self._anchors.start()
-        self.turns = StreamPoller([self._take])
+        self.turns = self
         self.ready = "ready; calibrating while the tag moves"
 
     def _on_frames(self, content: bytes) -> None:
@@ -188,8 +189,8 @@ class CalibrationNode(StreamNode):
         self.get_logger().info(response.message)
         return response
 
-    def _take(self) -> bool:
-        """Collect what has arrived, and return whether anything has."""
+    def take(self) -> float | None:
+        """Collect what has arrived, and return the rest after it, s; None if nothing has."""
         arrived = False
         for topic, end in self._inputs.items():
             messages, stamps = end.fetch_serialized()
@@ -203,7 +204,7 @@ class CalibrationNode(StreamNode):
         anchors = self._anchors.anchors
         if anchors is not None and not self._refused:
             self._serve(anchors)
-        return arrived
+        return REST if arrived else None
 
     def _serve(self, anchors: Anchors) -> None:
         """Give the next piece to the Worker, and use what it has found."""
