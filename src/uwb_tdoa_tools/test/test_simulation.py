@@ -42,20 +42,12 @@ def test_list_names_everything(capsys):
         assert name in out
 
 
-def test_writes_bag_json_and_plot(tmp_path, capsys):
-    bag, report, picture = (
-        tmp_path / "flight.bag",
-        tmp_path / "flight.json",
-        tmp_path / "flight.png",
-    )
-    assert (
-        command.main([*SHORT, "--out", str(bag), "--json", str(report), "--plot", str(picture)])
-        == 0
-    )
+def test_writes_bag_and_json(tmp_path, capsys):
+    bag, report = tmp_path / "flight.bag", tmp_path / "flight.json"
+    assert command.main([*SHORT, "--out", str(bag), "--json", str(report)]) == 0
     assert (bag / "metadata.yaml").is_file()
     content = json.loads(report.read_text())
     assert content["imu_samples"] == 20_000 and content["config"]["trajectory"] == "circle"
-    assert picture.read_bytes().startswith(b"\x89PNG")
     assert str(bag) in capsys.readouterr().out
 
 
@@ -113,7 +105,6 @@ def test_options_reach_the_configuration(tmp_path):
         (["--constellation", "nowhere"], "constellation: 'nowhere'"),
         (["--speed", "nan"], "speed: nan"),
         (["--anchors", "missing.yaml"], "missing.yaml"),
-        (["--plot", "picture.docx"], "plot: picture.docx"),
         (["--json", "no/such/place.json"], "no/such/place.json"),
         (["--trajectory", "loop"], "invalid choice: 'loop'"),
         (["--constellation", "six", "--anchors", "a.yaml"], "not allowed with"),

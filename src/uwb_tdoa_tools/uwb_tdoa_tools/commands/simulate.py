@@ -259,7 +259,7 @@ def parser() -> ArgumentParser:
         "simulate --out flight_bag",
         (
             "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out "
-            "circle_bag --plot circle.png"
+            "circle_bag"
         ),
         "simulate --vehicle rover --duration 90 --out rover_bag",
         'simulate --vehicle hand --path "-2,-3 2,-3 2,3 -2,3" --out walk_bag',
@@ -296,12 +296,6 @@ def parser() -> ArgumentParser:
                 type=OutputFile,
                 help="write the configuration, the true parameters and the counts",
             ),
-            option(
-                "--plot",
-                metavar="FILE",
-                type=OutputFile,
-                help="draw the path and the errors of the TDOAs",
-            ),
             *OPTIONS,
         ],
     )
@@ -310,14 +304,13 @@ def parser() -> ArgumentParser:
 def _simulate(args: Namespace) -> None:
     from ..bags.bag import check_output, write_bag
     from ..simulation import simulate
-    from ..simulation.report import catalogue, check_image, plot, summary
+    from ..simulation.report import catalogue, summary
 
     if args.list:
         cli.show(catalogue())
         return
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
-    check_image(args.plot)
     with cli.Progress("simulate", what="flying"):
         flight = simulate(config_of(args))
         content = summary(flight)
@@ -337,9 +330,6 @@ def _simulate(args: Namespace) -> None:
     if args.json is not None:
         cli.write_json(args.json, content)
         cli.show(f"wrote {args.json}")
-    if args.plot is not None:
-        plot(flight, args.plot)
-        cli.show(f"wrote {args.plot}")
 
 
 main = cli.executable(_simulate, parser)
