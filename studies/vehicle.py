@@ -3,7 +3,8 @@
 """vehicle: run both filters of the Crazyflie firmware over flights that took no part in a correction.
 
 The flights of each survey are halved, in the given order. The effects and the network of one half correct the
-other half. The network goes with the floor_multipath of the effects.
+other half. The network goes with the floor_multipath of the effects. With --build, a build of
+`export --crazyflie` is tried on all flights instead.
 """
 
 from pathlib import Path
@@ -18,12 +19,13 @@ from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import choices, cli
 from uwb_tdoa_tools.cli import OutputFolder
-from uwb_tdoa_tools.exporting.c_code import comparison, stddev_of, write_crazyflie
+from uwb_tdoa_tools.exporting.c_code import stddev_of, write_crazyflie
 from uwb_tdoa_tools.exporting.tracing import trace
 from uwb_tdoa_tools.main import main
 from uwb_tdoa_tools.readers import inputs
 
 from . import table
+from .firmware_filter import comparison, in_words
 
 
 def add_options(add):
@@ -33,7 +35,9 @@ def add_options(add):
     add("--survey", required=True, metavar="S", help=choices.SURVEY)
     add("--firmware", required=True, metavar="DIR", help="checkout of crazyflie-firmware")
     words = "corrections of each half; what is there is not made again"
-    add("--out", type=OutputFolder, required=True, metavar="DIR", help=words)
+    add("--out", type=OutputFolder, metavar="DIR", help=words)
+    add("--build", metavar="DIR", help="a build of export --crazyflie to try instead")
+    add("--config", metavar="FILE", help="ekf_node.yaml of that export")
 
 
 def halves(recordings):
@@ -62,9 +66,21 @@ def corrections(folder, training, survey):
     return ways, FilterConfig.from_yaml(effects / "ekf_node.yaml")
 
 
+def tried(args, flights):
+    """The lines on the errors of both filters with --build on some Flights."""
+    stddev = stddev_of(FilterConfig.from_yaml(args.config) if args.config else FilterConfig())
+    errors = comparison(Path(args.build), Path(args.firmware), flights, stddev)
+    return in_words(errors, [one.name for one in flights], stddev)
+
+
 def run(args):
     """Print a row for each flight, correction and filter: 3D RMSE in the air, m."""
     reading = inputs.Reading(args.survey)
+    if args.build:
+        cli.show(tried(args, reading.flights(args.flights)))
+        return
+    if not args.out:
+        raise InputError("--out: is missing, and so is --build; give one of them.")
     columns = "0.15 m", "stddev alone", "build"
     cli.show(table.head("flight", "correction", "filter", *columns, texts=3))
     errors = {}

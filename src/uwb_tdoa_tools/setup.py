@@ -30,9 +30,7 @@ setup(
         (f"share/{NAME}/config", glob("config/*.yaml")),
         (f"share/{NAME}/launch", glob("launch/*.py")),
     ],
-    package_data={
-        NAME: ["diagnosis/report/templates/*", "exporting/firmware/*", "readers/profiles/*"]
-    },
+    package_data={NAME: ["diagnosis/report/templates/*", "readers/profiles/*"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

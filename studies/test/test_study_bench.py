@@ -203,7 +203,7 @@ def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
         "  arm_mat_scale_f32(&O, 2, &O);\n}"
     )
     library = tmp_path / "inverse.so"
-    include = f"-I{ROOT / 'src/uwb_tdoa_tools/uwb_tdoa_tools/exporting/firmware'}"
+    include = f"-I{ROOT / 'studies/firmware'}"
     source = tmp_path / "inverse.c"
     run(CC, "-shared", "-fPIC", include, "-o", library, source, "-lm", check=True)
     a = np.random.default_rng(1).normal(size=(9, 9)).astype(np.float32)

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from functools import partial
-from pathlib import Path
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -63,17 +62,6 @@ def parser() -> ArgumentParser:
                 metavar="FILE",
                 help="ekf_node.yaml of diagnose or calibrate: the noise for --crazyflie",
             ),
-            option(
-                "--firmware",
-                metavar="DIR",
-                help="checkout of crazyflie-firmware, to try --crazyflie on --flights with a C compiler",
-            ),
-            option(
-                "--flights",
-                metavar="FLIGHT",
-                nargs="+",
-                help="flights with IMU and ground truth that took no part in diagnose or train",
-            ),
         ],
     )
 
@@ -93,10 +81,7 @@ def _export(args: Namespace) -> None:
     from ..exporting import c_code
     from ..exporting.onnx_file import write_onnx  # imports onnx
     from ..exporting.tracing import trace
-    from ..readers.inputs import Reading
 
-    if bool(args.firmware) != bool(args.flights):
-        raise InputError("--firmware and --flights: one needs the other; give both.")
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
     stddev = c_code.stddev_of(config)
     say = partial(cli.say, "export")
@@ -114,12 +99,8 @@ def _export(args: Namespace) -> None:
     name = traced.meta()["name"]
     for made in filter(None, (args.onnx, args.c, args.crazyflie)):
         cli.show(f"{name} for {len(anchors)} anchors in frame {anchors.frame} -> {made}")
-    if args.crazyflie and args.flights:
-        flights = Reading(args.survey).flights(args.flights)
-        errors = c_code.comparison(args.crazyflie, Path(args.firmware), flights, stddev)
-        cli.show(c_code.in_words(errors, [one.name for one in flights], stddev))
-    elif args.crazyflie:
-        say(f"{args.crazyflie}: not tried on flights; give --firmware and --flights.")
+    if args.crazyflie:
+        say(f"{args.crazyflie}: not tried on flights; docs/crazyflie.md says how to.")
 
 
 main = cli.executable(_export, parser)
