@@ -1,9 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The position bias map: markers, network, map, file and fit."""
+"""The position bias map: markers, map, file and fit."""
 
 from dataclasses import replace
-from math import atan2, exp, log, pi
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import (
     FADE,
-    AngularNetwork,
     BiasMap,
     Markers,
     Part,
@@ -74,73 +72,22 @@ def test_corrected_bias_is_the_mean_of_the_integrals_along_the_axes():
     np.testing.assert_allclose(corrected_bias(Markers(cell, true, alike, std)), alike, atol=1e-12)
 
 
-# --- network ---
-
-
-def gentle(at):
-    """Return positive values. No value is 8 times a neighbour, so eq. A5 has positive widths."""
-    return 1.0 + 0.3 * np.sin(at[:, 0]) + 0.2 * np.cos(2.0 * at[:, 1])
-
-
-def slow(cell, at, b, x):
-    """Evaluate eqs. A1 - A8 one by one for one position. b : values, all positive"""
-    total, c1 = 0.0, 0.5
-    c3 = (1 - c1) / (8 * c1)
-    for i in range(len(at)):
-        d2 = float(np.sum((x - at[i]) ** 2))
-        if d2 >= 1.0:
-            continue
-        widths = []
-        for j in range(len(at)):
-            if j != i and np.abs(cell[i] - cell[j]).max() == 1:
-                away = at[j] - at[i]
-                width = -log(c3 * b[j] / b[i]) / float(away @ away)
-                widths.append((atan2(away[1], away[0]), width))
-        widths.sort()
-        around = [(theta + turn, width) for turn in (-2 * pi, 0, 2 * pi) for theta, width in widths]
-        c2 = np.interp(atan2(x[1] - at[i][1], x[0] - at[i][0]), *zip(*around))
-        total += c1 * b[i] * exp(-c2 * d2)
-    return total
-
-
-def test_equations_of_the_appendix():
-    cell, at = grid(4)
-    at = at + 0.04 * np.random.default_rng(2).standard_normal(at.shape)
-    values = gentle(at)
-    places = np.random.default_rng(5).uniform(-0.5, 2.0, (60, 2))
-    found = AngularNetwork(cell, at, values[:, None], STEP)(places)
-    np.testing.assert_allclose(found[:, 0], [slow(cell, at, values, x) for x in places], atol=1e-9)
-
-
-def test_an_inner_node_keeps_its_value():
-    cell, at = grid(5)
-    values = gentle(at)[:, None]
-    inner = ((cell > 0) & (cell < 4)).all(axis=1)
-    found = AngularNetwork(cell, at, values, STEP)(at[inner])
-    # Nodes two steps away still contribute a little.
-    np.testing.assert_allclose(found, values[inner], atol=0.02)
-
-
-def test_negative_values_are_shifted_and_far_away_the_smallest_one_is_left():
-    cell, at = grid(4)
-    values = np.sin(3.0 * at[:, :1]) - 0.1
-    found = AngularNetwork(cell, at, values, STEP)(np.vstack([at, [[50.0, 50.0]]]))
-    assert found[-1, 0] == pytest.approx(values.min())
-    assert (found >= values.min() - 1e-12).all()
-
-
-def test_a_node_without_neighbours_and_columns_apart():
-    cell, values = np.array([[0, 0], [5, 5]]), np.array([[0.2, -0.3], [0.1, 0.4]])
-    found = AngularNetwork(cell, STEP * cell, values, STEP)(STEP * cell)
-    np.testing.assert_allclose(found, [[0.1, -0.3], [0.05, -0.3 + 0.5 * 0.7]])
-
-
 # --- map ---
 
 
 def make_map(bias=(0.0, -0.2), **fields):
-    cell, at = grid(4)
-    return BiasMap(cell, at, np.tile(bias, (16, 1)), 0.01 * np.eye(2), STEP, **fields)
+    _, at = grid(4)
+    return BiasMap(at, np.tile(bias, (16, 1)), 0.01 * np.eye(2), STEP, **fields)
+
+
+def test_it_is_the_bias_at_the_markers_and_smooth_between_them():
+    _, at = grid(5)
+    bias = 0.1 * np.column_stack([np.sin(2.0 * at[:, 0]), np.cos(2.0 * at[:, 1])])
+    one = BiasMap(at, bias, 0.01 * np.eye(2), STEP)
+    np.testing.assert_allclose(one.bias_at(at), bias, atol=0.02)
+    between = np.random.default_rng(5).uniform(0.0, 2.0, (60, 2))
+    expected = 0.1 * np.column_stack([np.sin(2.0 * between[:, 0]), np.cos(2.0 * between[:, 1])])
+    np.testing.assert_allclose(one.bias_at(between), expected, atol=0.03)
 
 
 def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows():
@@ -149,7 +96,7 @@ def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows():
     p = np.column_stack([1.5 + x, np.full(6, 0.75), np.full(6, 9.0)])
     found, covariance, validity = one.correct(p, np.repeat(before, 6, axis=0))
     np.testing.assert_allclose(validity, np.clip(1.0 - x / FADE, 0.0, 1.0), atol=1e-12)
-    # All biases are the smallest one, which the network gives everywhere.
+    # All biases are alike, and so the map gives the same everywhere.
     np.testing.assert_allclose(p - found, np.outer(validity, [0.0, -0.2, 0.0]), atol=1e-12)
     # The covariance has the error of the map, and the bias that remains uncorrected.
     uncorrected = np.outer((1.0 - validity) ** 2, [0.0, 0.2**2, 0.0])
@@ -159,7 +106,7 @@ def test_outside_of_the_hull_the_correction_fades_and_the_covariance_grows():
 
 def test_a_hole_in_the_markers_is_not_known():
     cell = np.array([[0, 0], [0, 1], [1, 0], [10, 0], [10, 1], [9, 0], [5, 9]])
-    one = BiasMap(cell, STEP * cell, np.full((7, 2), 0.1), np.eye(2), STEP)
+    one = BiasMap(STEP * cell, np.full((7, 2), 0.1), np.eye(2), STEP)
     assert one.validity(np.array([[0.2, 0.2], [2.5, 1.0]])).tolist() == [1.0, 0.0]
 
 
@@ -189,9 +136,9 @@ def test_file(tmp_path):
         assert not again.belongs_to(other)
     assert not make_map().belongs_to(anchors)
     with np.load(tmp_path / "map.npz") as content:
-        assert int(content["version"]) == 3 and "metres" in str(content["units"])
+        assert int(content["version"]) == 4 and "metres" in str(content["units"])
         fields = dict(content)
-    np.savez(tmp_path / "old.npz", **{**fields, "version": 2})
+    np.savez(tmp_path / "old.npz", **{**fields, "version": 3})
     (tmp_path / "text.npz").write_bytes(b"something else")
     for name in ("old", "text"):
         with pytest.raises(InputError, match="is no position bias map .* make one with"):

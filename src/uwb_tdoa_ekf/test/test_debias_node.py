@@ -31,7 +31,7 @@ def file(tmp_path):
     cell = np.stack(np.meshgrid(range(4), range(4), indexing="ij"), axis=-1).reshape(-1, 2)
     own = {"ids": ANCHORS.ids, "positions": ANCHORS.positions}
     bias = np.tile([-0.1, -0.2], (16, 1))
-    BiasMap(cell, 0.5 * cell, bias, 0.01 * np.eye(2), 0.5, **own).save(tmp_path / "map.npz")
+    BiasMap(0.5 * cell, bias, 0.01 * np.eye(2), 0.5, **own).save(tmp_path / "map.npz")
     ANCHORS.to_yaml(tmp_path / "anchors.yaml")
     return tmp_path / "map.npz"
 

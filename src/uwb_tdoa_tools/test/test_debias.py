@@ -89,7 +89,7 @@ def wrong_map(path, bias, anchors):
     cell = np.stack(np.meshgrid(range(-5, 6), range(-5, 6)), axis=-1).reshape(-1, 2)
     own = {"ids": anchors.ids, "positions": anchors.positions}
     bias = np.tile(bias, (len(cell), 1))
-    BiasMap(cell, 1.0 * cell, bias, np.zeros((2, 2)), 1.0, **own).save(path)
+    BiasMap(1.0 * cell, bias, np.zeros((2, 2)), 1.0, **own).save(path)
 
 
 @pytest.mark.parametrize(

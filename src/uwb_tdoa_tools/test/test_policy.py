@@ -53,7 +53,7 @@ def arguments(tmp_path):
     """Return arguments with which each node uses all its topics and services."""
     Anchors.from_positions(np.eye(3)).to_yaml(tmp_path / "anchors.yaml")
     cell = np.stack(np.meshgrid(*[np.arange(3)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    BiasMap(cell, 0.5 * cell, np.zeros((9, 2)), 0.01 * np.eye(2), 0.5).save(tmp_path / "map.npz")
+    BiasMap(0.5 * cell, np.zeros((9, 2)), 0.01 * np.eye(2), 0.5).save(tmp_path / "map.npz")
     own = {
         "anchors_node": ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"],
         "autopilot_node": [
