@@ -110,13 +110,21 @@ def test_a_wrong_stamp_is_no_end_of_a_piece():
     assert [piece.first - EPOCH for piece in out] == pytest.approx([0.0, PIECE])
 
 
-def test_short_and_too_many_messages_are_left_out(monkeypatch):
+def test_a_message_without_a_stamp_is_left_out():
     cutter = PieceCutter()
     cutter.add(TDOAS, 0, b"\0" * 5)
     assert (cutter.left_out, len(cutter)) == (1, 0)
-    monkeypatch.setattr(pieces, "MOST_BYTES", 1000)
-    cut_all(cutter, [("imu/data", 0.01 * k) for k in range(1000)])
-    assert cutter.left_out > 900 and len(cutter) < 100
+
+
+def test_an_imu_beside_a_silent_radio_takes_no_memory_and_stops_nothing(monkeypatch):
+    monkeypatch.setattr(pieces, "MOST_BYTES", 100_000)
+    cutter, most = PieceCutter(), 0
+    for k in range(20_000):
+        cutter.add("imu/data", k, message(0.01 * k))
+        most = max(most, len(cutter))
+    assert most < 6000 and cutter.left_out > 14_000
+    out = cut_all(cutter, [(TDOAS, one) for one in np.arange(200.0, 300.0, 0.1)])
+    assert len(out) == 2
 
 
 def test_pieces_of_a_bag_are_the_pieces_of_its_flight(tmp_path):

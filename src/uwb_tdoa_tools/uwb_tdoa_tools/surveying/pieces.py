@@ -43,7 +43,7 @@ TDOAS, FRAMES = "uwb/tdoa", "/tf_static"
 # {topic: type} of a piece: what the filter takes, with raw TDOAs
 TOPICS = {topic: kind for name in STREAMS if name != "pose" for topic, kind in topics_of(name)}
 LATE = 1.0  # s, largest delay of a message behind messages with later stamps
-MOST_BYTES = 200_000_000  # of the messages that wait for the end of a piece
+MOST_BYTES = 100_000_000  # of the messages that wait for the end of a piece
 MOST_KEPT = 3  # calibrations in a folder
 LOWEST_PRIORITY = 19
 STAMP = struct.Struct("<iI")  # of a message that begins with a Header
@@ -91,7 +91,7 @@ class PieceCutter:
 
     Attributes
     ----------
-    left_out : number of messages without a stamp, or beyond MOST_BYTES
+    left_out : number of messages without a stamp, or that waited beyond MOST_BYTES
     """
 
     def __init__(self) -> None:
@@ -114,9 +114,12 @@ class PieceCutter:
 
     def add(self, topic: str, arrived: int, content: bytes) -> None:
         """Collect a message of TOPICS. arrived : ns."""
-        if len(content) < ENCAPSULATION + STAMP.size or self._bytes > MOST_BYTES:
+        if len(content) < ENCAPSULATION + STAMP.size:
             self.left_out += 1
             return
+        if self._bytes > MOST_BYTES:  # of an IMU beside a silent radio
+            self.left_out += len(self)
+            self._begin([])
         second, nanosecond = STAMP.unpack_from(content, ENCAPSULATION)
         t = (second * 10**9 + nanosecond) / 1e9
         self._messages.append(Message(topic, t, arrived, content))
