@@ -98,7 +98,8 @@ class RadioResidual(ChannelResidual):
             named = np.isin(samples.anchors.ids, ids)
             rows = np.flatnonzero(named[samples.a] | named[samples.b])
             samples = of_rows(samples, rows)
-        values = np.nan_to_num(effect.regressors(samples, list(keys)))
+        values = effect.regressors(samples, list(keys))
+        values = np.where(np.isfinite(values), values, 0.0)
         if self.innovations is not None:
             values = self.innovations.by_bias(values)
         return self.cells.means(values, rows)
@@ -163,8 +164,11 @@ class Cells:
         self.chosen = chosen[order][good]
         self.group = np.unique(group[good], return_inverse=True)[1]
         self.size = np.bincount(self.group).astype(float)
-        self.t = self.mean(samples.t)
         start = np.searchsorted(self.group, np.arange(len(self.size)))
+        ends = [*start, len(self.chosen)]
+        shape = len(self.size), len(samples)
+        self._members = csr_array((np.ones(len(self.chosen)), self.chosen, ends), shape)
+        self.t = self.mean(samples.t)
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
@@ -174,7 +178,7 @@ class Cells:
             other measurements count as 0, and the result is sparse.
         """
         if rows is None:
-            return np.stack([self.mean(column) for column in values.T], axis=1)
+            return self._members @ values / self.size[:, None]
         # For each measurement its row of `values`, or -1. Measurements after the last one in a cell
         # have no entry.
         row_of = np.full(self.chosen.max(initial=-1) + 1, -1)
@@ -190,7 +194,7 @@ class Cells:
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """Return means of values (n,) of all n measurements over the m cells, (m,)."""
-        return np.bincount(self.group, values[self.chosen]) / self.size
+        return self._members @ values / self.size
 
 
 def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
