@@ -460,7 +460,7 @@ class Worth:
         return Displacements([np.array([[now, 0.0, 0.0]])], off)
 
 
-def selected(monkeypatch, worth, shares=((1.0, 1.0),), flights=2):
+def selected(monkeypatch, worth, shares=((1.0, 1.0),), flights=2, detections=()):
     """Return the ValidatedSelection of effects by their worth. shares : of each in two flights."""
     trials = Worth(worth)
     of_each = dict(zip(worth, [*shares, *[(1.0, 1.0)] * len(worth)]))
@@ -473,7 +473,7 @@ def selected(monkeypatch, worth, shares=((1.0, 1.0),), flights=2):
     selection = SimpleNamespace(
         chosen=tuple(map(Some, worth)), kept=lambda candidates, share=None: tuple(candidates)
     )
-    attribution = SimpleNamespace(selection=selection, detections=(), names=("f", "g"))
+    attribution = SimpleNamespace(selection=selection, detections=detections, names=("f", "g"))
     return select_by_error(attribution, [None] * flights, Baseline(NONE))
 
 
@@ -502,6 +502,23 @@ def test_fewer_are_dropped_where_displacements_do_not_add_up(monkeypatch):
 def test_values_shrink_by_the_power_of_the_error_that_remains(monkeypatch, worth, flights, share):
     """Without "a", the error is its worth and 0.5 m larger than 1 m. It is not applied at -1 m."""
     assert selected(monkeypatch, {"a": worth}, flights=flights).share == pytest.approx(share)
+
+
+@pytest.mark.parametrize(("beside", "kept"), [(0.06, ("c",)), (0.02, ())])
+def test_effects_must_gain_beside_the_noise_too(monkeypatch, beside, kept):
+    """Without the noise, the effect is worth 0.2 m of 1.2 m. Beside it, it is worth `beside`."""
+
+    def start(self, candidates, detections):
+        lost = (beside if detections else 0.2) * ("c" not in candidates)
+        return 1.0 + lost - 0.1 * len(detections)
+
+    monkeypatch.setattr(Worth, "start", start)
+    monkeypatch.setattr(Worth, "error", start)
+    noise = Detection(EFFECTS["noise_level"]({"0-1": 0.3}), "tdoa", {})
+    found = selected(monkeypatch, {"c": 0.0}, flights=1, detections=(noise,))
+    assert found.selection == kept and found.detections == (noise,)
+    why = f"beside the noise that was found, {90 + 100 * beside:.1f} cm without, 90.0 cm with"
+    assert [one.why for one in found.refused] == [why] * (not kept)
 
 
 def test_effects_beside_an_event_of_one_flight_are_judged_again_without_it(monkeypatch):

@@ -163,9 +163,10 @@ def select_by_error(
     The filter runs without each candidate. The displacements of the position by all candidates
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
-    only if the error falls with them. At most TRIAL_FLIGHTS flights are judged. Of two flights none
-    may get worse by an effect. Events at a time are tried for their worth, but not kept: another
-    flight does not have them at the same time.
+    only if the error falls with them. Beside them the candidates must still gain LOSS together. At
+    most TRIAL_FLIGHTS flights are judged. Of two flights none may get worse by an effect. Events at
+    a time are tried for their worth, but not kept: another flight does not have them at the same
+    time.
 
     map_function : as of `attribute`
     poses : of an earlier ValidatedSelection of these flights, for the first corrections
@@ -226,7 +227,13 @@ def select_by_error(
         misleading.update(one.name for one in little if one.declared)
     # The fit takes errors of its flights alone for effects of all flights. They are likely where much
     # of the error remains, and average out over flights.
-    remains = min(error / trials.error([], detections), 1.0) if candidates else 0.0
+    without = trials.error([], detections) if candidates else error
+    if detections and candidates and gain(without, error) < LOSS:
+        # The noise gains, and these have ridden along: they were judged without it.
+        why = f"beside the noise that was found, {_with_and_without(error, without)}"
+        refused += [Refused(one.label, why) for one in candidates]
+        candidates, error = [], without
+    remains = min(error / without, 1.0) if candidates else 0.0
     share = 1.0 - UNEXPLAINED * remains**2 / len(flights)
     # with the weights of the trials
     selection = attribution.selection.kept(candidates, share)
