@@ -1,7 +1,10 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
+from copy import deepcopy
 from functools import reduce
+from itertools import product
 import struct
+import time
 
 import pytest
 
@@ -11,6 +14,8 @@ from geometry_msgs.msg import Point, TransformStamped, TwistStamped, TwistWithCo
 from hypothesis import given, strategies as st
 from nav_msgs.msg import Odometry, Path
 import numpy as np
+import rclpy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
@@ -18,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.ros import cdr
 from uwb_tdoa_bias.ros.anchors import read_transforms
 from uwb_tdoa_bias.ros.cdr import LONGEST_TEXT, MOST_ELEMENTS, CdrCodec, Unreadable, decode
-from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
+from uwb_tdoa_msgs.msg import AnchorArray, Calibration, Tdoa, TdoaCorrected, TdoaResidual
 
 # --- encodings ---
 
@@ -178,6 +183,40 @@ def test_what_cannot_be_read_is_left_out_and_said(reason):
     assert len(refused) == 2
     with pytest.raises(Unreadable, match=reason):
         codec.read([BAD[reason]])
+
+
+def test_empty_lists_of_numbers_are_read_as_they_are_published():
+    """The middleware serializes them to more bytes than it sends."""
+    rclpy.init()
+    node, sent = rclpy.create_node("sender"), []
+    try:
+        qos = QoSProfile(depth=100)
+        publisher = node.create_publisher(Calibration, "calibration", qos)
+        node.create_subscription(Calibration, "calibration", sent.append, qos, raw=True)
+        frames = "m", "map", "frame"
+        messages = [
+            Calibration(
+                ids=range(n), shifts=[0.5] * some, delays=[0.5] * n, covariance=[0.5] * more
+            )
+            for n, some, more in product(range(4), (0, 3), (0, 1))
+        ]
+        for message, frame in product(messages, frames):
+            message = deepcopy(message)
+            message.header.frame_id = frame
+            before = len(sent)
+            until = time.monotonic() + 60.0
+            while len(sent) == before:
+                assert time.monotonic() < until
+                if publisher.get_subscription_count() and len(sent) == before:
+                    publisher.publish(message)
+                rclpy.spin_once(node, timeout_sec=0.5)
+            assert decode(sent[-1], Calibration) == message
+            for end in range(len(sent[-1])):
+                with pytest.raises(Unreadable):
+                    decode(sent[-1][:end], Calibration)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_lists_are_bounded_before_anything_is_allocated():

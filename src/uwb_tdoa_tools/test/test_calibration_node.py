@@ -104,11 +104,12 @@ class Listener:
 
     messages : Calibrations in the order of arrival
     values, text : of /diagnostics of calibration_node
+    corrects : values of /diagnostics of bias_node
     """
 
     def __init__(self):
         self.node = rclpy.create_node("listener")
-        self.messages, self.values, self.text = [], {}, ""
+        self.messages, self.values, self.text, self.corrects = [], {}, "", {}
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self.node.create_subscription(
@@ -122,6 +123,8 @@ class Listener:
             if status.name == "/calibration_node":
                 self.text = status.message
                 self.values = {each.key: each.value for each in status.values}
+            if status.name == "/bias_node":
+                self.corrects = {each.key: each.value for each in status.values}
 
     def wait(self, condition, what):
         until = time.monotonic() + PATIENCE
@@ -206,7 +209,8 @@ def test_live_is_the_stream_of_the_recording_to_the_bit(recorded, tmp_path, list
     bag, survey = recorded
     folder = tmp_path / "kept"
     node = run(*node_words(survey, folder))
-    listener.wait(lambda: listener.values, "the node")
+    run("uwb_tdoa_bias.bias_node", "--ros-args", "-p", "calibrated:=true")
+    listener.wait(lambda: listener.values and listener.corrects, "the nodes")
     assert listener.messages[-1].number == 0 and not np.any(listener.messages[-1].shifts)
     replay = run(*replay_words(bag))
     listener.wait(lambda: listener.values["pieces taken"] == "3", "three pieces")
@@ -228,6 +232,8 @@ def test_live_is_the_stream_of_the_recording_to_the_bit(recorded, tmp_path, list
 
     listener.wait(arrived, "the calibration")
     np.testing.assert_array_equal(listener.messages[-1].covariance, message.covariance)
+    listener.wait(lambda: listener.corrects["calibration"] == str(number), "bias_node to take it")
+    assert listener.corrects["unreadable on /uwb/calibration"] == "0"
     # a hand-over has 20 steps, some of which may be missed
     shown = np.array([one.shifts for one in listener.messages])
     assert np.abs(np.diff(shown, axis=0)).max() < 0.25 * np.abs(shown).max()
