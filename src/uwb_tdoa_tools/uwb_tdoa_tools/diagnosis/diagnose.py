@@ -507,9 +507,11 @@ def _findings(
         known = [worth[each] for each in tried if each in worth]
         return replace(finding, added=added, worth=float(np.sum(known)) if known else None)
 
-    def usable_there(finding: EffectFinding) -> bool:
-        return finding.effect.is_hypothesis if finding.on_floor else finding.effect.usable
-
-    out = [with_worth(finding, usable_there(finding)) for finding in model]
+    out = [
+        with_worth(
+            finding, finding.effect.is_hypothesis if finding.on_floor else finding.effect.usable
+        )
+        for finding in model
+    ]
     added = {finding.key for finding in out}
     return out + [with_worth(finding, False) for finding in others if finding.key not in added]

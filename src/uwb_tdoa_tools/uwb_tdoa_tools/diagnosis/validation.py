@@ -178,7 +178,10 @@ def select_by_error(
     worth: dict[Candidate | Detection, float] = {}
     misleading: set[str] = set()
     error = trials.start(candidates, detections)
-    while applicable := _applicable(candidates):
+    # Only what a node can correct, at least in part, is tried.
+    while applicable := [
+        one for one in candidates if any(term.effect.usable for term in one.terms)
+    ]:
         displacements = trials.displacements(candidates, applicable)
         gone = _dropped(displacements, applicable)
         if not gone:
@@ -230,8 +233,12 @@ def select_by_error(
     without = trials.error([], detections) if candidates else error
     if detections and candidates and gain(without, error) < LOSS:
         # The noise gains, and these have ridden along: they were judged without it.
-        why = f"beside the noise that was found, {_with_and_without(error, without)}"
-        refused += [Refused(one.label, why) for one in candidates]
+        refused += [
+            Refused(
+                one.label, f"beside the noise that was found, {_with_and_without(error, without)}"
+            )
+            for one in candidates
+        ]
         candidates, error = [], without
     remains = min(error / without, 1.0) if candidates else 0.0
     share = 1.0 - UNEXPLAINED * remains**2 / len(flights)
@@ -330,11 +337,6 @@ class Displacements:
             after, before = (rms(np.linalg.norm(part, axis=1)) for part in (error, error + change))
             losses.append((-gain(before, after), before, after))
         return max(losses)
-
-
-def _applicable(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Return the Candidates that a node can correct, at least in part."""
-    return [one for one in candidates if any(term.effect.usable for term in one.terms)]
 
 
 def why_without(error: float, without: float) -> str:

@@ -165,9 +165,10 @@ class Cells:
         self.group = np.unique(group[good], return_inverse=True)[1]
         self.size = np.bincount(self.group).astype(float)
         start = np.searchsorted(self.group, np.arange(len(self.size)))
-        ends = [*start, len(self.chosen)]
-        shape = len(self.size), len(samples)
-        self._members = csr_array((np.ones(len(self.chosen)), self.chosen, ends), shape)
+        self._members = csr_array(
+            (np.ones(len(self.chosen)), self.chosen, [*start, len(self.chosen)]),
+            (len(self.size), len(samples)),
+        )
         self.t = self.mean(samples.t)
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 

@@ -193,15 +193,10 @@ def refit(
 
 def _scales(table: RegressionTable, residual: np.ndarray) -> np.ndarray:
     """Return the scale of Student's t per group by the fixed point of its likelihood, (groups,)."""
-    out = _one_each(table)
+    out = np.ones(AXES * len(table.channels))
     for k, rows in table.groups:
         out[k] = student_scale(residual[rows])
     return out
-
-
-def _one_each(table: RegressionTable) -> np.ndarray:
-    """Return ones for all groups, with or without rows, (groups,)."""
-    return np.ones(AXES * len(table.channels))
 
 
 def student_scale(r: np.ndarray) -> float:
@@ -271,7 +266,7 @@ def measure_inflation(
     residual : (n,) of a fit with all columns, because effects that are left count as noise
     weight : (n,) robust weights; scale : (groups,)
     """
-    out = _one_each(table)
+    out = np.ones(AXES * len(table.channels))
     x = table.matrix(columns)
     for k, rows in table.groups:
         r = weight[rows] * residual[rows] / scale[k]
