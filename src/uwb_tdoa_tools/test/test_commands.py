@@ -25,7 +25,7 @@ from uwb_tdoa_tools.bags.files import PLUGINS
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
 from uwb_tdoa_tools.flying.vehicle import WORLDS
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS, corners
+from uwb_tdoa_tools.simulation.config import CONSTELLATIONS, VEHICLE_DEFAULTS, corners
 from uwb_tdoa_tools.simulation.vehicles import TRAJECTORIES
 
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -102,6 +102,7 @@ def test_help_and_usage_errors_import_nothing_heavy():
         (choices.STORAGES, PLUGINS),
         (choices.REFERENCES, REFERENCES),
         (choices.TRAJECTORIES, TRAJECTORIES),
+        (choices.CONSTELLATIONS, CONSTELLATIONS),
         (choices.CARRIERS, VEHICLE_DEFAULTS),
         (choices.WORLDS, WORLDS),
     ],

@@ -35,13 +35,6 @@ SHORT = ["--duration", "20", "--trajectory", "circle"]
 ACROSS = Walls(((4.0, -10.0, 4.0, 2.0, np.inf),))
 
 
-def test_list_names_everything(capsys):
-    assert command.main(["--list"]) == 0
-    out = capsys.readouterr().out
-    for name in ("rising_circle", "spin", "corners", "planar", "random-SEED"):
-        assert name in out
-
-
 def test_writes_bag_and_json(tmp_path, capsys):
     bag, report = tmp_path / "flight.bag", tmp_path / "flight.json"
     assert command.main([*SHORT, "--out", str(bag), "--json", str(report)]) == 0

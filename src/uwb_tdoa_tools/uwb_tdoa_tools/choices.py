@@ -51,6 +51,20 @@ TRAJECTORIES = (
     "hover",
     "spin",
 )
+CONSTELLATIONS = (
+    "corners",
+    "tilted",
+    "low_ceiling",
+    "small_room",
+    "wall_middles",
+    "staircase",
+    "pillars",
+    "six",
+    "six_wide",
+    "hall",
+    "planar",
+    "pair",
+)
 YAW_PROFILES = "fixed", "along_track", "rotating"
 PROTOCOLS = "tdoa2", "tdoa3"
 CARRIERS = "quadrotor", "rover", "hand"  # what carries a simulated tag

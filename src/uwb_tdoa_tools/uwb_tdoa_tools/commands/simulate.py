@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .. import cli
-from ..choices import CARRIERS, PROTOCOLS, STORAGES, TRAJECTORIES, YAW_PROFILES
+from ..choices import CARRIERS, CONSTELLATIONS, PROTOCOLS, STORAGES, TRAJECTORIES, YAW_PROFILES
 from ..cli import OutputBag, OutputFile, exclusive, group, option
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.flight import Flight
+
     from ..simulation.config import SimulationConfig
 
 POSE = "t", "x", "y", "z", "yaw"  # columns of --poses
@@ -121,7 +123,10 @@ OPTIONS = (
                 "--constellation",
                 metavar="NAME",
                 **UNSET,
-                help=("name, random-SEED or random-SEED-COUNT (default: corners; rover: six_wide)"),
+                help=(
+                    f"{', '.join(CONSTELLATIONS)}, random-SEED or random-SEED-COUNT "
+                    "(default: corners; rover: six_wide)"
+                ),
             ),
             option(
                 "--anchors",
@@ -273,13 +278,7 @@ def parser() -> ArgumentParser:
             "--protocol tdoa3 --out cells_bag"
         ),
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact_bag",
-        "simulate --list",
         options=[
-            option(
-                "--list",
-                action="store_true",
-                help="list trajectories and constellations, and do nothing else",
-            ),
             option(
                 "--out",
                 metavar="BAG",
@@ -304,16 +303,12 @@ def parser() -> ArgumentParser:
 def _simulate(args: Namespace) -> None:
     from ..bags.bag import check_output, write_bag
     from ..simulation import simulate
-    from ..simulation.report import catalogue, summary
 
-    if args.list:
-        cli.show(catalogue())
-        return
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     with cli.Progress("simulate", what="flying"):
         flight = simulate(config_of(args))
-        content = summary(flight)
+        content = _summary(flight)
     cli.show(
         f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, "
         f"{content['poses']} poses"
@@ -330,6 +325,22 @@ def _simulate(args: Namespace) -> None:
     if args.json is not None:
         cli.write_json(args.json, content)
         cli.show(f"wrote {args.json}")
+
+
+def _summary(flight: Flight) -> dict[str, Any]:
+    """Return plain values for JSON: counts, sizes of the TDOA errors (m), config, true parameters."""
+    assert flight.imu is not None and flight.truth is not None
+    parts = flight.extra["tdoa_truth"]
+    return {
+        "flight": flight.name,
+        "tdoas": len(flight.tdoa),
+        "imu_samples": len(flight.imu),
+        "poses": len(flight.truth),
+        "outliers": int(parts["outlier"].sum()),
+        **{f"{name}_std": float(parts[name].std()) for name in ("bias", "multipath", "noise")},
+        "config": flight.meta["config"],
+        "parameters": flight.meta["parameters"],
+    }
 
 
 main = cli.executable(_simulate, parser)
