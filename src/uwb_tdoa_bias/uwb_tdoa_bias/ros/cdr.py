@@ -238,10 +238,14 @@ def decode(data: bytes, kind: type[Message]) -> Message:
         raise Unreadable(f"{len(data)} bytes cannot be read as {name_of(kind)}") from error
     # With lists of doubles the middleware may serialize to more bytes than it sends. It reads no list
     # that is cut off.
-    if DOUBLES in kind.get_fields_and_field_types().values():
+    if _has_doubles(kind):
         length = min(length, len(data))
     check_length(data, length, kind)
     return message
+
+
+def _has_doubles(kind: Any) -> bool:
+    return DOUBLES in kind.get_fields_and_field_types().values()
 
 
 def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
