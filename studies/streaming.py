@@ -26,8 +26,9 @@ from .surveying import at, measured_flights
 
 SHAKES = 0.05, 0.1, 0.2  # m, default of --tape
 CHANGE = 0.3  # m, of a changed anchor
+SETTLED = 120.0  # s
 LARGEST_RATIO = 1.2  # of the error after a change to that of the unharmed flight
-OF_CHANGES = "third flight, unharmed", "given", "in use", "at most 1.2 times", "changes named"
+OF_CHANGES = "after 120 s, unharmed", "given", "in use", "at most 1.2 times", "changes named"
 FEWEST_SECONDS = 10.0  # of a piece that is judged
 _UTIL = "util/const{}-tdoa2{}.csv.gz"
 _DAY = "flights/{}-traj{}"
@@ -113,8 +114,9 @@ def changed(data, trial):
     """Cases of a trial ((set, tape m, kind), seed), one for each anchor.
 
     The stream begins with the first flight. The anchor moves by CHANGE with the second, or is late by
-    CHANGE from its middle on. Judged is the third flight. A case: error without the change, with
-    it and the anchors as given, with it and the calibration in use, m; whether it was named.
+    CHANGE from its middle on. Judged is the third flight, from SETTLED s of flight after the change.
+    A case: error without the change, with it and the anchors as given, with it and the calibration
+    in use, m; how often a change was named.
     """
     (name, std, kind), seed = trial
     true = flights_of(name, data)[:3]
@@ -123,8 +125,9 @@ def changed(data, trial):
     places = true[0].anchors.positions + std * noise
     before = StreamCalibration(at(true[0], places).anchors, Tape(std))
     _taken([at(true[0], places)], before)
-    healthy = deepcopy(before)
-    unharmed = _taken([at(flight, places) for flight in true[1:]], healthy)[0]
+    share = 1.0 if kind == "moved" else 0.5  # of the second flight, after the change
+    settled = true[2].start + SETTLED - share * true[1].duration
+    unharmed, _ = _taken([at(flight, places) for flight in true[1:]], deepcopy(before), settled)
     out = []
     for anchor in true[0].anchors.ids.tolist():
         if kind == "moved":
@@ -137,15 +140,15 @@ def changed(data, trial):
             effect = AnchorDelay(values={str(anchor): CHANGE})
         later = [_with(flight, effect) for flight in true[1:]]
         if kind == "late":
-            middle = true[1].start + 0.5 * true[1].duration
+            middle = true[1].start + share * true[1].duration
             d = np.where(true[1].tdoa.t < middle, true[1].tdoa.d, later[0].tdoa.d)
             later[0] = replace(true[1], tdoa=replace(true[1].tdoa, d=d))
         given = [at(flight, places) for flight in later]
-        in_use, named = _taken(given, deepcopy(before))
-        whole = in_pieces(given[-1])
+        in_use, named = _taken(given, deepcopy(before), settled)
         odometry = _odometry(given[-1], EffectSet())
-        errors = [_rmse(given[-1], odometry, piece) for piece in whole]
-        out.append((unharmed, np.sqrt(np.nanmean(np.square(errors))), in_use, named))
+        pieces = [piece for piece in in_pieces(given[-1]) if piece.start >= settled]
+        errors = [_rmse(given[-1], odometry, piece) for piece in pieces]
+        out.append((unharmed, _mean(errors), in_use, named))
     return out
 
 
@@ -154,15 +157,23 @@ def _with(flight, effect):
     return effect.inject(flight, np.random.default_rng(0))
 
 
-def _taken(flights, calibration):
-    """Give flights to a StreamCalibration. Returns (error in the last flight m, changes named)."""
+def _taken(flights, calibration, settled=-np.inf):
+    """Give flights to a StreamCalibration.
+
+    settled : stamp s. Returns (error in later pieces of the last flight m, number of changes named).
+    """
     errors, named = [], 0
     for flight in flights:
         errors = []
         for piece in in_pieces(flight):
-            errors.append(_rmse(flight, _odometry(flight, calibration.effects), piece))
+            if flight is flights[-1] and piece.start >= settled:
+                errors.append(_rmse(flight, _odometry(flight, calibration.effects), piece))
             named += _names_change(calibration.take(piece))
-    return float(np.sqrt(np.nanmean(np.square(errors)))), named
+    return _mean(errors), named
+
+
+def _mean(errors):
+    return float(np.sqrt(np.nanmean(np.square(errors))))
 
 
 def _odometry(flight, effects):
