@@ -16,6 +16,7 @@ from nav_msgs.msg import Odometry  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.launching import (
+    LAUNCH_FILES,
     NODES,
     RANGE,
     Lives,
@@ -215,6 +216,27 @@ def test_topics_of_tags_have_other_names(tmp_path):
     assert second.words[2:6] == ["-r", "velocity/odometry:=wheels", "-r", "imu/data:=/imu2"]
     with pytest.raises(InputError, match="remaps: do not go with processes"):
         tags(file, {}, processes="1")
+
+
+def test_one_tag_calibrates_the_anchors_of_all(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text("calibrated: true\ncalibration_folder: kept\ntags: {a: {}, b: {}}")
+    (one,) = (node for node in tags(file, {}) if node.executable == "calibration_node")
+    assert one.namespace == "a" and one.parameters[-1] == {
+        "calibration_folder": str(tmp_path / "kept")
+    }
+    told = [node.parameters[-1] for node in tags(file, {}) if node.executable == "bias_node"]
+    assert [one["calibrated"] for one in told] == [True, True]
+
+
+def test_the_calibration_takes_the_parameters_of_the_filter(tmp_path):
+    launch = LAUNCH_FILES["tdoa.launch.py"]
+    given = {name: default or "" for name, (default, *_) in launch.arguments.items()}
+    names = [node.executable for node in launch.starts(given)]
+    assert "calibration_node" not in names
+    given |= {"calibrated": "true", "ekf_params": "ekf.yaml", "calibration_params": "own.yaml"}
+    (node,) = (one for one in launch.starts(given) if one.executable == "calibration_node")
+    assert node.parameters == ["own.yaml", {"ekf_params": "ekf.yaml"}]
 
 
 def test_as_many_processes_as_cores(tmp_path):
