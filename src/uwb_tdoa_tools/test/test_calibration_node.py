@@ -21,9 +21,12 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import TransformStamped  # noqa: E402
 from programs import start  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.serialization import serialize_message  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
@@ -31,12 +34,12 @@ from uwb_tdoa_bias.common.survey import read_survey  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, calibration_to_message  # noqa: E402
 from uwb_tdoa_ekf.launching import NODES  # noqa: E402
-from uwb_tdoa_msgs.msg import Calibration  # noqa: E402
+from uwb_tdoa_msgs.msg import Calibration, Tdoa  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.calibrating import in_pieces  # noqa: E402
 from uwb_tdoa_tools.calibration_node import PARAMETERS, CalibrationNode  # noqa: E402
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape  # noqa: E402
-from uwb_tdoa_tools.surveying.pieces import keep, last_kept  # noqa: E402
+from uwb_tdoa_tools.surveying.pieces import Message, Piece, keep, last_kept  # noqa: E402
 from uwb_tdoa_tools.surveying.stream import PIECE, StreamCalibration  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "calibration_node.yaml"
@@ -94,6 +97,30 @@ def test_anchors_that_cannot_be_calibrated_are_an_error_and_end_nothing(tmp_path
         level, text, _ = node._report()
         assert level == DiagnosticStatus.ERROR and why in text
         assert not node._target.number and list(node._target.ids) == [0, 1, 2, 3]
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def test_the_reader_gets_each_transform_though_others_are_repeated(tmp_path):
+    rclpy.init()
+    node = CalibrationNode()
+    try:
+        for child, x in (("mast", 0.1), *[("camera", 0.2)] * 200):
+            place = TransformStamped(child_frame_id=child)
+            place.header.frame_id = "base_link"
+            place.transform.translation.x = x
+            node._on_frames(TFMessage(transforms=[place]))
+        messages = []
+        for k in range(20):
+            tdoa = Tdoa(anchor_a=0, anchor_b=1, distance_difference=0.1)
+            tdoa.header.frame_id = "mast"
+            tdoa.header.stamp.sec, tdoa.header.stamp.nanosec = 1_700_000_000, 10_000_000 * k
+            stamp = 1.7e9 + 0.01 * k
+            messages.append(Message("uwb/tdoa", stamp, round(1e9 * stamp), serialize_message(tdoa)))
+        Piece(0, 1.7e9, messages, [*node._frames.values()]).write(tmp_path / "piece")
+        flight = read_bag(tmp_path / "piece", anchors=Anchors.from_positions(np.eye(4, 3)))
+        assert len(flight.tdoa) == 20 and flight.meta["antenna"] == pytest.approx([0.1, 0.0, 0.0])
     finally:
         node.destroy_node()
         rclpy.shutdown()

@@ -23,6 +23,7 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
+from rclpy.serialization import serialize_message
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
@@ -102,7 +103,7 @@ class CalibrationNode(StreamNode):
         self._tape = Tape(own["tape_std"], trusted=tuple(filter(None, own["trusted"])))
         folder = own["calibration_folder"]
         self._folder = Path(folder) if folder else None
-        self._cutter, self._frames = PieceCutter(), list[bytes]()
+        self._cutter, self._frames = PieceCutter(), dict[tuple[str, ...], bytes]()
         self._pieces: list[Piece] = []  # that wait
         self._worker: Worker | None = None
         self._counts: Counter[str] = Counter()
@@ -118,7 +119,7 @@ class CalibrationNode(StreamNode):
         self._inputs = {
             topic: StreamInput(self, message_class(kind), topic) for topic, kind in TOPICS.items()
         }
-        Input(self, TFMessage, "/tf_static", self._on_frames, TF_STATIC_QOS, read=bytes)
+        Input(self, TFMessage, "/tf_static", self._on_frames, TF_STATIC_QOS)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.create_service(SetBool, "~/use", self._on_use)
         self.create_timer(STEP, self._hand_over, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -127,8 +128,11 @@ class CalibrationNode(StreamNode):
         self.turns = self
         self.ready = "ready; calibrating while the tag moves"
 
-    def _on_frames(self, content: bytes) -> None:
-        self._frames = [*self._frames, content][-MOST_FRAMES:]
+    def _on_frames(self, message: TFMessage) -> None:
+        """Keep the last message on the same frames; publishers may repeat theirs."""
+        children = tuple(each.child_frame_id for each in message.transforms)
+        if children in self._frames or len(self._frames) < MOST_FRAMES:
+            self._frames[children] = serialize_message(message)
 
     def _on_anchors(self, anchors: Anchors) -> None:
         """Start with Anchors, from the last calibration of them that was kept."""
@@ -215,7 +219,9 @@ class CalibrationNode(StreamNode):
             if self._pieces and (self._worker is None or not self._worker.busy):
                 self._worker = self._worker or self._new_worker(anchors)
                 piece = self._pieces.pop(0)
-                self._worker.give(Piece(piece.number, piece.first, piece.messages, self._frames))
+                self._worker.give(
+                    Piece(piece.number, piece.first, piece.messages, [*self._frames.values()])
+                )
         except (EOFError, OSError):
             self._counts["crashes"] += 1
             self._trouble = "the process that calibrates has ended: the next piece starts another; check the memory"
