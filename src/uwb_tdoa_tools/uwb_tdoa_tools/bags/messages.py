@@ -52,6 +52,7 @@ OUR_TYPES = (
     "TdoaResidual",
     "Anchor",
     "AnchorArray",
+    "Calibration",
     "EstimatorStatus",
     *(
         of.message.rpartition("/")[2]
