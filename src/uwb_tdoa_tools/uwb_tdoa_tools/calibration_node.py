@@ -23,7 +23,6 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.serialization import serialize_message
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
@@ -40,7 +39,7 @@ from uwb_tdoa_bias.ros.anchors import (
     AnchorsInput,
     calibration_to_message,
 )
-from uwb_tdoa_bias.ros.cdr import message_class
+from uwb_tdoa_bias.ros.cdr import decode, message_class
 from uwb_tdoa_bias.ros.node import (
     Diagnostics,
     Parameter,
@@ -86,6 +85,10 @@ REST = 0.05  # s between two turns: nobody waits for this node
 MOST_WAITING = 2  # pieces that wait for the process
 
 
+def _with_bytes(content: bytes) -> tuple[bytes, TFMessage]:
+    return content, decode(content, TFMessage)
+
+
 class CalibrationNode(StreamNode):
     """Cut what it hears into pieces, and publish what a Worker finds from them."""
 
@@ -119,7 +122,7 @@ class CalibrationNode(StreamNode):
         self._inputs = {
             topic: StreamInput(self, message_class(kind), topic) for topic, kind in TOPICS.items()
         }
-        Input(self, TFMessage, "/tf_static", self._on_frames, TF_STATIC_QOS)
+        Input(self, TFMessage, "/tf_static", self._on_frames, TF_STATIC_QOS, read=_with_bytes)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.create_service(SetBool, "~/use", self._on_use)
         self.create_timer(STEP, self._hand_over, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -128,11 +131,12 @@ class CalibrationNode(StreamNode):
         self.turns = self
         self.ready = "ready; calibrating while the tag moves"
 
-    def _on_frames(self, message: TFMessage) -> None:
+    def _on_frames(self, received: tuple[bytes, TFMessage]) -> None:
         """Keep the last message on the same frames; publishers may repeat theirs."""
+        content, message = received
         children = tuple(each.child_frame_id for each in message.transforms)
         if children in self._frames or len(self._frames) < MOST_FRAMES:
-            self._frames[children] = serialize_message(message)
+            self._frames[children] = content
 
     def _on_anchors(self, anchors: Anchors) -> None:
         """Start with Anchors, from the last calibration of them that was kept."""
