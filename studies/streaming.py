@@ -59,7 +59,7 @@ def run(args):
         changes(args)
         return
     columns = "set", "tape off by [m]", "in use after piece", "third piece, given", "in use"
-    columns += "other flights, given", "in use", "worst piece, ratio", "changes named"
+    columns += "other flights, given", "in use", "worst piece, ratio"
     cli.show(table.head(*columns))
     rows = [(name, std) for name in table.chosen(args, SETS) for std in args.tape]
     for (name, std), draws in table.trials(partial(drawn, args.data), rows, args):
@@ -89,12 +89,8 @@ def drawn(data, trial):
             errors = [_rmse(flight, known[k], piece) for k in (0, now)]
             step = calibration.take(piece)
             if piece.duration > FEWEST_SECONDS:
-                out.append((number, *errors, step.taken, _names_change(step)))
+                out.append((number, *errors, step.taken))
     return out
-
-
-def _names_change(step):
-    return step.taken and "anchor" in step.text
 
 
 def changes(args):
@@ -104,7 +100,7 @@ def changes(args):
     rows = [(name, std, kind) for name in sets for std in args.tape for kind in ("moved", "late")]
     for row, draws in table.trials(partial(changed, args.data), rows, args):
         cases = np.array([case for draw in draws for case in draw])
-        unharmed, given, in_use, named = cases.T
+        unharmed, _, in_use, named = cases.T
         cells = [f"{value:.3f}" for value in np.median(cases[:, :3], axis=0)]
         good = np.count_nonzero(in_use <= LARGEST_RATIO * unharmed)
         cli.show(table.line([*row, *cells, f"{good} of {len(cases)}", int(named.sum())]))
@@ -168,7 +164,8 @@ def _taken(flights, calibration, settled=-np.inf):
         for piece in in_pieces(flight):
             if flight is flights[-1] and piece.start >= settled:
                 errors.append(_rmse(flight, _odometry(flight, calibration.effects), piece))
-            named += _names_change(calibration.take(piece))
+            step = calibration.take(piece)
+            named += step.taken and "anchor" in step.text
     return _mean(errors), named
 
 
@@ -198,7 +195,6 @@ def _summary(draws):
     third = np.array([one[2][1:3] for one in draws])
     others = np.array([row[1:3] for one in draws for row in one if row[0] > 0])
     ratios = [row[2] / row[1] for one in draws for row in one]
-    named = sum(row[4] for one in draws for row in one)
     when = f"{np.median(begun):g} ({len(begun)} of {len(draws)})" if begun else "never"
     means = [f"{value:.3f}" for value in (*third.mean(axis=0), *np.nanmean(others, axis=0))]
-    return [when, *means, f"{np.nanmax(ratios):.2f}", named]
+    return [when, *means, f"{np.nanmax(ratios):.2f}"]

@@ -38,8 +38,7 @@ from .correction.corrector import (
     warm_up,
 )
 from .correction.model import EFFECTS, FADED, NETWORK, PASSED, load_network
-from .effects import Effect, EffectSet, LabelEffect
-from .effects.anchor import AnchorDelay, AnchorPosition
+from .effects import EffectSet, LabelEffect
 from .effects.base import relabelled
 from .effects.tag import TagLeverArm
 from .ros.anchors import (
@@ -151,19 +150,6 @@ class Antenna:
     heard: int = 0
 
 
-def with_anchors_of(effects: EffectSet, found: Collection[Effect] = ()) -> EffectSet:
-    """Return an EffectSet that begins with positions and delays of anchors, for a calibration.
-
-    found : effects that replace its own; without any it keeps them, or gets such of 0
-    """
-    of_anchors = {
-        kind.name: next((one for one in (*found, *effects) if one.name == kind.name), kind())
-        for kind in (AnchorPosition, AnchorDelay)
-    }
-    others = [one for one in effects if one.name not in of_anchors]
-    return EffectSet((*of_anchors.values(), *others), effects.covariance)
-
-
 class BiasNode(StreamNode):
     """Node around a Corrector: converts messages and counts them.
 
@@ -195,7 +181,7 @@ class BiasNode(StreamNode):
                     "calibrated: changes the correction while the node runs, and frozen forbids that; "
                     "leave one of them out."
                 )
-            effects = with_anchors_of(effects)  # they are compiled now
+            effects = effects.with_anchors()  # they are compiled now
             self._calibrations = Input(
                 self, Calibration, CALIBRATION, self._on_calibration, ANCHORS_QOS
             )
@@ -291,9 +277,9 @@ class BiasNode(StreamNode):
         except InputError as error:
             self.warn_at_times(CALIBRATION, f"{CALIBRATION}: not taken: {error}")
             return
-        self._calibration, self._effects = message.number, with_anchors_of(self._effects, found)
+        self._calibration, self._effects = message.number, self._effects.with_anchors(found)
         for antenna in self._all_antennas:
-            antenna.effects = with_anchors_of(antenna.effects, found)
+            antenna.effects = antenna.effects.with_anchors(found)
             if antenna.corrector is not None:
                 antenna.corrector.change_effects(antenna.effects)
 

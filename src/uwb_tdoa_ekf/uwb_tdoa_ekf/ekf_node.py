@@ -28,6 +28,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from uwb_tdoa_bias.common import sensors
 from uwb_tdoa_bias.common.anchors import Anchors, FlyableVolume
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors import SENSORS
@@ -642,12 +643,7 @@ class EkfNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node and return the exit code."""
-    topics = (
-        f"{topic} ({kind.replace('/msg', '')})"
-        for sensor in SENSORS.values()
-        for topic, kind in sensor.topics
-    )
-    return run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
+    return run(EkfNode, __doc__.replace("SENSORS", sensors.in_words()), argv)
 
 
 if __name__ == "__main__":

@@ -204,7 +204,7 @@ def run():
 def recorded(tmp_path_factory):
     """A bag of three pieces and a rest, with anchors as a tape has them, and their file."""
     folder = tmp_path_factory.mktemp("recorded")
-    flight = clean_flight(300, 3.9 * PIECE)  # the end of a replay may be missing
+    flight = clean_flight(300, 3.1 * PIECE)
     off = np.random.default_rng(7).normal(0.0, TAPE, flight.anchors.positions.shape)
     flight = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
     write_bag(flight, folder / "bag")
@@ -229,7 +229,16 @@ def node_words(survey, folder):
 
 
 def replay_words(bag):
-    return ["uwb_tdoa_tools.commands", "replay", bag, "--rate", RATE, "--wait-topics", "uwb/tdoa"]
+    return [
+        "uwb_tdoa_tools.commands",
+        "replay",
+        bag,
+        "--rate",
+        RATE,
+        "--wait-topics",
+        "uwb/tdoa",
+        "imu/data",
+    ]
 
 
 @pytest.mark.slow
@@ -237,7 +246,9 @@ def test_live_is_the_stream_of_the_recording_to_the_bit(recorded, tmp_path, list
     bag, survey = recorded
     folder = tmp_path / "kept"
     node = run(*node_words(survey, folder))
-    run("uwb_tdoa_bias.bias_node", "--ros-args", "-p", "calibrated:=true")
+    # without TDOAs: the replay must begin with calibration_node, and not with the first of both
+    given = ["-p", "calibrated:=true", "-r", "uwb/tdoa:=nowhere"]
+    run("uwb_tdoa_bias.bias_node", "--ros-args", *given)
     listener.wait(lambda: listener.values and listener.corrects, "the nodes")
     assert listener.messages[-1].number == 0 and not np.any(listener.messages[-1].shifts)
     replay = run(*replay_words(bag))

@@ -27,9 +27,9 @@ from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from uwb_tdoa_bias.bias_node import CALIBRATION
+from uwb_tdoa_bias.common import sensors
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.ros.anchors import (
     ANCHORS_FILE,
@@ -82,7 +82,7 @@ PARAMETERS = {  # in the order of config/calibration_node.yaml
 }
 HAND_OVER, STEP = 5.0, 0.25  # s, of a new calibration, and between the messages of it
 REST = 0.05  # s between two turns: nobody waits for this node
-MOST_WAITING = 2  # pieces that wait for the process
+MOST_PIECES = 2  # pieces that wait for the process
 
 
 def _with_bytes(content: bytes) -> tuple[bytes, TFMessage]:
@@ -207,7 +207,7 @@ class CalibrationNode(StreamNode):
             for content, stamp in zip(messages, stamps):
                 self._cutter.add(topic, stamp, content)
         self._pieces += self._cutter.pieces()
-        left_out, self._pieces = self._pieces[:-MOST_WAITING], self._pieces[-MOST_WAITING:]
+        left_out, self._pieces = self._pieces[:-MOST_PIECES], self._pieces[-MOST_PIECES:]
         self._counts["left out"] += len(left_out)
         anchors = self._anchors.anchors
         if anchors is not None and not self._refused:
@@ -298,12 +298,7 @@ class CalibrationNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node, and return the exit code."""
-    topics = (
-        f"{topic} ({kind.replace('/msg', '')})"
-        for sensor in SENSORS.values()
-        for topic, kind in sensor.topics
-    )
-    return run(CalibrationNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
+    return run(CalibrationNode, __doc__.replace("SENSORS", sensors.in_words()), argv)
 
 
 if __name__ == "__main__":

@@ -259,6 +259,18 @@ class EffectSet:
         """Return the EffectSet of the effects that meet a condition."""
         return EffectSet(tuple(effect for effect in self.effects if condition(effect)))
 
+    def with_anchors(self, found: Sequence[Effect] = ()) -> EffectSet:
+        """Return the EffectSet with the positions and delays of anchors in `found`, and the other effects.
+
+        Without such it keeps its own, or gets one without values.
+        """
+        own = {one.name: one for one in (AnchorPosition(), AnchorDelay(), *self.effects, *found)}
+        of_anchors = own[AnchorPosition.name], own[AnchorDelay.name]
+        others = self.where(
+            lambda effect: effect.name not in (AnchorPosition.name, AnchorDelay.name)
+        )
+        return EffectSet((*of_anchors, *others), self.covariance)
+
     @cached_property
     def state_dependent(self) -> EffectSet:
         """Return the effects that `bias_jacobian` differentiates."""

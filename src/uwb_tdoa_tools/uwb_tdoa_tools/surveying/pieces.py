@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 import multiprocessing
 from multiprocessing.connection import Connection
@@ -48,7 +48,6 @@ MOST_KEPT = 3  # calibrations in a folder
 LOWEST_PRIORITY = 19
 STAMP = struct.Struct("<iI")  # of a message that begins with a Header
 ENCAPSULATION = 4  # bytes before it
-OF_ANCHORS = AnchorPosition, AnchorDelay
 
 
 class Message(NamedTuple):
@@ -280,11 +279,7 @@ def last_kept(folder: Path, given: Anchors, base: EffectSet) -> tuple[int, Effec
         for i, row in zip(given.ids.tolist(), (anchors.positions - given.positions).tolist())
         for axis, value in zip("xyz", row)
     }
-    found = [
-        replace(one, values=shifts) if isinstance(one, AnchorPosition) else one
-        for one in kept
-        if isinstance(one, OF_ANCHORS)
-    ]
-    others = [one for one in base if not isinstance(one, OF_ANCHORS)]
+    delays = [one for one in kept if isinstance(one, AnchorDelay)]
+    effects = base.with_anchors([AnchorPosition(values=shifts), *delays])
     age = time.time() - path.stat().st_mtime
-    return max(numbers), EffectSet((*others, *found), kept.covariance), age
+    return max(numbers), EffectSet(effects.effects, kept.covariance), age

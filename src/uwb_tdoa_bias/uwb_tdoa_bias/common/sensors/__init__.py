@@ -42,6 +42,12 @@ BY_POSE = tuple(
 )  # channels compared with poses alone, without anchors
 
 
+def in_words() -> str:
+    """Return "topic (type)" of all topics of SENSORS, for the help of a node."""
+    topics = [topic for sensor in SENSORS.values() for topic in sensor.topics]
+    return ",\n".join(f"{topic} ({kind.replace('/msg', '')})" for topic, kind in topics)
+
+
 def measured_on(flight: Any, channel: str) -> Stream | None:
     """Return the Stream of a channel of the diagnosis in a Flight; None without data."""
     name = STREAM_OF[channel]
@@ -70,6 +76,7 @@ __all__ = [
     "Sensor",
     "Stream",
     "Velocity",
+    "in_words",
     "measured_on",
     "with_measured",
 ]
