@@ -96,8 +96,8 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     "calibrated": Parameter(
         False,
         (
-            "take positions and delays of anchors from /uwb/calibration, as calibration_node finds "
-            "them, in the place of those of effects_file"
+            "take positions and delays of anchors from /uwb/calibration, which calibration_node "
+            "finds, instead of those in effects_file"
         ),
     ),
     "body_frame": Parameter(
