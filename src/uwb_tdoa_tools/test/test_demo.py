@@ -7,6 +7,7 @@ import shlex
 from types import SimpleNamespace
 
 import numpy as np
+from programs import python
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -298,3 +299,17 @@ def test_a_given_flight_through_the_real_nodes(recorded, diagnosis, tmp_path, ca
     assert corrected == pytest.approx(without_ros, abs=1.01e-3)
     for name in ("flight_bag", "recorded_bag", "error.png"):
         assert (tmp_path / "out" / name).exists()
+
+
+def test_the_set_up_is_no_time_of_the_demo():
+    """`./dev` compiles in processes of its own, and then becomes the demo."""
+    done = python(
+        "-c",
+        "import os, subprocess, sys\n"
+        "subprocess.run([sys.executable, '-c', 'for _ in range(10**7): pass'])\n"
+        "before = sum(os.times()[2:4])\n"
+        "from uwb_tdoa_tools.flying.demo import processor_time\n"
+        "print(before, sum(os.times()[:4]) - processor_time())",
+    )
+    of_set_up, left_out = map(float, done.stdout.split())
+    assert of_set_up > 0.05 and left_out == pytest.approx(of_set_up, abs=0.02)
