@@ -44,6 +44,7 @@ from .effects.tag import TagLeverArm
 from .ros.anchors import (
     ANCHORS_FILE,
     ANCHORS_QOS,
+    CALIBRATION,
     MOST_FRAMES,
     AnchorsInput,
     FramesInput,
@@ -111,7 +112,6 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
 }
 POSE = "pose", "twist"  # fields read of an Odometry: numbers
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # fields read of a Tdoa
-CALIBRATION = "/uwb/calibration"  # of all tags of an installation
 CORRECTED = (  # fields written of a TdoaCorrected
     "anchor_a",
     "anchor_b",

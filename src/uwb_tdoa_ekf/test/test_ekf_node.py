@@ -21,6 +21,7 @@ import numpy as np  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, CALIBRATION  # noqa: E402
 from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
 from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
@@ -29,6 +30,7 @@ from uwb_tdoa_ekf.frames import pose_from_message  # noqa: E402
 from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding  # noqa: E402
 from uwb_tdoa_ekf.monitoring.status import FAULT  # noqa: E402
 from uwb_tdoa_ekf.results import Odometry  # noqa: E402
+from uwb_tdoa_msgs.msg import Calibration  # noqa: E402
 
 # --- ekf node ---
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
@@ -78,6 +80,24 @@ def test_the_end_of_a_fault_opens_the_filter(node):
     node._judge()
     assert opened == [True]
     node._estimator = None
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_calibration_begins_the_search_for_changes_anew(frozen):
+    rclpy.init(args=["--ros-args", "-p", f"frozen:={str(frozen).lower()}"])
+    node, begun = EkfNode(), []
+    try:
+        node._estimator = SimpleNamespace(recalibrated=lambda: begun.append(True))
+        publisher = node.create_publisher(Calibration, CALIBRATION, ANCHORS_QOS)
+        topics = [each.topic_name for each in node.subscriptions]
+        assert (CALIBRATION in topics) == (not frozen)
+        publisher.publish(Calibration())
+        while not begun and not frozen:
+            rclpy.spin_once(node)
+    finally:
+        node._estimator = None
+        node.destroy_node()
+        rclpy.shutdown()
 
 
 def test_a_velocity_is_turned_into_the_body_by_its_frame(node):

@@ -540,6 +540,8 @@ def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arr
     assert (
         estimator.alarms[0].startswith(f"anchor {FIRST}: ") and estimator.counts["compensated"] == 0
     )
+    estimator.recalibrated()
+    assert estimator.alarms == []
 
 
 # --- late imu ---

@@ -67,10 +67,11 @@ def played(
     moving=True,
     heard=lambda t, a, b: t == t,
     rejected=lambda t: 0.0,
+    first=0,
 ):
-    """Return the same as `watch`, for a given Monitor."""
+    """Return the same as `watch`, for a given Monitor, from the second `first` on."""
     rng, said = np.random.default_rng(seed), []
-    for second in range(seconds):
+    for second in range(first, first + seconds):
         t = second + np.arange(RATE) / RATE
         a = np.arange(RATE) % 6
         b = (a + 1) % 6
@@ -164,6 +165,18 @@ def test_an_alarm_ends_with_its_cause():
     (event,) = watch.history
     assert event.finding.rule == "anchor_changed"
     assert 25.0 < event.since < 33.0 and 34.0 < event.until < 42.0
+
+
+def test_a_new_calibration_is_no_change_of_an_anchor():
+    """A correction that ends an old error looks like an anchor that has changed."""
+    for restarted in (False, True):
+        monitor = Monitor(ANCHORS)
+        played(monitor, lambda t, p: only(2, 0.4), seconds=30)
+        if restarted:
+            monitor.restart()
+        later = played(monitor, lambda t, p: only(2, 0.0), seconds=30, first=30)
+        assert any(alarms for _, alarms in later) != restarted
+        assert bool(monitor.history) != restarted
 
 
 def test_names_the_anchor_that_is_not_heard_any_more():

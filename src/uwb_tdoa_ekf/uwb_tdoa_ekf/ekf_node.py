@@ -3,7 +3,8 @@
 """ekf_node: inertial samples and corrected TDOAs in, odometry out.
 
 imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray),
-/tf_static; if they are there: SENSORS, initialpose (geometry_msgs/PoseWithCovarianceStamped)
+/tf_static; if they are there: SENSORS, initialpose (geometry_msgs/PoseWithCovarianceStamped),
+/uwb/calibration (Calibration, which bias_node applies)
   -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for
   each TdoaCorrected),
      status (EstimatorStatus: whether the odometry may be flown by), /diagnostics
@@ -36,7 +37,14 @@ from uwb_tdoa_bias.common.transforms import Place
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet, ImuCorrector, StreamCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.ros.anchors import MOST_FRAMES, AnchorsInput, FramesInput, unknown_frame
+from uwb_tdoa_bias.ros.anchors import (
+    ANCHORS_QOS,
+    CALIBRATION,
+    MOST_FRAMES,
+    AnchorsInput,
+    FramesInput,
+    unknown_frame,
+)
 from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
 from uwb_tdoa_bias.ros.node import (
     Diagnostics,
@@ -48,7 +56,7 @@ from uwb_tdoa_bias.ros.node import (
     run,
 )
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, Streams, several_publishers
-from uwb_tdoa_msgs.msg import TdoaCorrected
+from uwb_tdoa_msgs.msg import Calibration, TdoaCorrected
 
 from .compile_nodes import warm_up
 from .core.config import FilterConfig
@@ -187,6 +195,8 @@ class EkfNode(StreamNode):
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
         self._pose = Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
+        if not self.frozen:  # or anybody could keep changes from being found
+            Input(self, Calibration, CALIBRATION, self._on_calibration, ANCHORS_QOS)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
         self._status = StatusOutput(self)
@@ -268,6 +278,10 @@ class EkfNode(StreamNode):
         return StreamWatch(
             anchors, self._lag, [FEW_ANCHORS] if self._config.known_height_std > 0.0 else []
         )
+
+    def _on_calibration(self, _: Calibration) -> None:
+        if self._estimator is not None:
+            self._estimator.recalibrated()
 
     def _on_config(self, config: FilterConfig) -> None:
         self._config = config

@@ -438,6 +438,14 @@ class Estimator:
         """
         self._pipeline.change_anchors(self._anchor_table.change(anchors))
 
+    def recalibrated(self) -> None:
+        """Search for changes anew: from now on TDOAs are corrected by another calibration.
+
+        It contains the changes that were found before.
+        """
+        if self._pipeline.monitor is not None:
+            self._pipeline.monitor.restart()
+
     def reset(self) -> tuple[Odometry, Residuals]:
         """Process all measurements that wait, then clear the filter; return (Odometry, Residuals).
 

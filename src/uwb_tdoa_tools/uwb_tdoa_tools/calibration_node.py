@@ -26,7 +26,6 @@ from rclpy.clock import Clock, ClockType
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_bias.bias_node import CALIBRATION
 from uwb_tdoa_bias.common import sensors
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
@@ -34,6 +33,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.ros.anchors import (
     ANCHORS_FILE,
     ANCHORS_QOS,
+    CALIBRATION,
     MOST_FRAMES,
     TF_STATIC_QOS,
     AnchorsInput,

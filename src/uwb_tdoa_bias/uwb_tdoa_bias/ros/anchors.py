@@ -31,6 +31,7 @@ from .topics import Input, Refusals, publishers_of
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+CALIBRATION = "/uwb/calibration"  # of all tags of an installation
 MOST_FRAMES = 100  # names that a node remembers; a topic may carry any number of them
 SAME_TURN = 1e-3  # largest difference of quaternions of the same anchor
 # Best effort and volatile: such a subscription receives messages from every publisher.

@@ -153,10 +153,10 @@ class Monitor:
         # number of sign flips of all TDOAs, and the stamp of the last, in s
         self.turns, self._turned = (0, -math.inf)
         self._agreed = -math.inf  # s, end of the last slice in which the filter accepted most TDOAs
-        self._forget()
+        self.restart()
 
-    def _forget(self) -> None:
-        # Reset everything that belongs to one flight; the history stays.
+    def restart(self) -> None:
+        """Reset everything that belongs to one flight, or to one calibration; the history stays."""
         # data of the current slice and later
         self._odometry: list[Odometry] = []
         self._residuals: list[Residuals] = []
@@ -279,7 +279,7 @@ class Monitor:
         self._residuals, self._odometry = [residuals], [odometry]
         # the loop has stopped before `until`, at LOST_TIME after the last TDOA: the flight is over
         if self._end <= until:
-            self._forget()
+            self.restart()
             self._odometry = [odometry]
             self._keep_one_slice()
 

@@ -25,9 +25,12 @@ from ..diagnosis.self_calibration.prior import with_calibration
 from ..diagnosis.self_calibration.solve import LEFT, AnchorChange
 
 PIECE = 45.0  # s; a solution needs 30 s of motion
-# Smallest ratio of the slow innovations without and with a first calibration, or a changed anchor, on
-# data that was not used
+# Smallest ratio of the slow innovations without and with a first calibration on data that was not used,
+# and of those after and before a change of the anchors
 SMALLEST_RATIO = 1.5
+# Pieces whose median shows what the calibration in use leaves: after half as many it is what is left
+# after a change that nothing explains
+MOST_LEVELS = 8
 MOST_WAITING = 4  # pieces with little motion that one solution joins
 
 
@@ -81,8 +84,7 @@ class StreamCalibration:
         self._tape, self._config = tape, config
         self._candidates: list[SelfCalibration] = []
         self._waiting: list[Flight] = []
-        # m, slow innovations on the piece that judged the calibration in use
-        self._level = np.inf if effects.covariance is None else LEFT
+        self._levels: list[float] = []  # m, slow innovations on the last pieces
 
     def take(self, piece: Flight) -> Step:
         """Judge the candidates on a piece, then find the next ones from it."""
@@ -90,32 +92,33 @@ class StreamCalibration:
             before = self._slow(piece, self.effects)
         except InputError as error:
             return Step(piece.name, piece.start, piece.end, np.nan, np.nan, False, str(error))
+        changed = bool(before > SMALLEST_RATIO * self._level)
         text, after = "nothing to judge yet", np.nan
         taken = False
         for candidate in self._candidates:
-            effects = with_calibration(
-                self.effects, candidate.found(candidate.shifts), candidate.covariance
-            )
             try:
+                effects = with_calibration(
+                    self.effects, candidate.found(candidate.shifts), candidate.covariance
+                )
                 after = self._slow(piece, effects)
-                why_not = candidate.why_not or self._reason_against(candidate, before, after)
+                why_not = candidate.why_not or self._reason_against(changed, before, after)
             except InputError as error:  # these anchors give no estimate
                 why_not = str(error)
             text = f"not taken: {why_not}"
             if why_not is None:
-                self.effects, self._level = effects, after
-                self.number, taken = self.number + 1, True
+                self.effects, self.number, taken = effects, self.number + 1, True
                 changes = [change.as_text() for change in _changes(candidate)]
                 text = "; ".join([f"calibration {self.number} is in use", *changes])
                 break
-        changed = not taken and bool(before > SMALLEST_RATIO * self._level)
-        found = self._find(piece, changed)
+        if self.effects.covariance is not None:
+            self._levels = [*self._levels, after if taken else before][-MOST_LEVELS:]
+        found = self._find(piece, changed and not taken)
         return Step(piece.name, piece.start, piece.end, before, after, taken, text + found)
 
     def _find(self, piece: Flight, changed: bool) -> str:
         """Set the candidates, and return a phrase on why there are none, or "".
 
-        changed : whether a single anchor may have changed; such a candidate is judged first
+        changed : whether the anchors have changed
         """
         self._candidates = []
         self._waiting = [*self._waiting, piece][-MOST_WAITING:]
@@ -123,37 +126,45 @@ class StreamCalibration:
         flights = [replace(one, anchors=anchors) for one in self._waiting]
         # an unknown anchor is placed once
         tape = replace(self._tape, unknown=()) if self.number else self._tape
+        steady = replace(tape, steady=True)
+        tries = [(tape if base.covariance is None else steady, base)]
+        if changed:  # a single anchor, or all
+            tries = [(tape, base), (steady, replace(base, covariance=None))]
+        text = ""
+        for one, known in tries:
+            try:
+                self._candidates.append(self_calibrate(flights, one, known, self._config))
+            except InputError as error:
+                text = f"; no new solution: {error}"
+        self._waiting = [] if self._candidates else self._waiting
+        return text
+
+    @property
+    def _level(self) -> float:
+        """Return slow innovations that the calibration in use leaves, m."""
         if self.effects.covariance is None:
-            tapes = [tape]
-        else:
-            tapes = [tape] * changed + [replace(tape, steady=True)]
-        try:
-            for tape in tapes:
-                self._candidates.append(self_calibrate(flights, tape, base, self._config))
-        except InputError as error:
-            return f"; no new solution: {error}"
-        self._waiting = []
-        return ""
+            return np.inf
+        return float(np.median(self._levels)) if self._levels else LEFT
 
     def _slow(self, piece: Flight, effects: EffectSet) -> float:
         anchors, others = in_place(self.given, effects)
         return slow_innovations([replace(piece, anchors=anchors)], others, self._config)
 
-    def _reason_against(
-        self, candidate: SelfCalibration, before: float, after: float
-    ) -> str | None:
+    def _reason_against(self, changed: bool, before: float, after: float) -> str | None:
         """Return why slow innovations on data that was not used forbid a candidate, or None.
 
+        changed : whether these anchors have changed since the last calibration
         before, after : m, slow innovations
         """
-        first = self.effects.covariance is None
         fall = f"slow innovations go from {100 * before:.1f} to {100 * after:.1f} cm"
-        if first and after > LEFT:
-            return f"{fall}: more than {100 * LEFT:.1f} cm"
-        ratio = SMALLEST_RATIO if first or _changes(candidate) else 1.0
-        if before < ratio * after:
-            return fall if ratio == 1.0 else f"{fall}: by less than a factor of {ratio:g}"
-        return None
+        if self.effects.covariance is None:
+            if after > LEFT:
+                return f"{fall}: more than {100 * LEFT:.1f} cm"
+            if before < SMALLEST_RATIO * after:
+                return f"{fall}: by less than a factor of {SMALLEST_RATIO:g}"
+        if changed and after > SMALLEST_RATIO * self._level:
+            return f"{fall}: not back to {100 * self._level:.1f} cm"
+        return fall if after > before else None
 
 
 def _changes(found: SelfCalibration) -> Sequence[AnchorChange]:

@@ -287,8 +287,10 @@ def self_calibrate(
     for row, placed in suspects.items():
         unknown = replace(tape, unknown=(spread.prior.ids[row],))
         try:
-            found[POSITION, row] = _alone(spread, calibrated((unknown, placed)))
-        except InputError:  # too few anchors are left
+            one = _alone(spread, calibrated((unknown, placed)))
+            one.found(one.shifts)  # refuses a place beyond what an effect may state
+            found[POSITION, row] = one
+        except InputError:  # too few anchors are left, or it is nowhere near
             continue
     for row in list(suspects)[:1]:
         later = np.eye(len(spread.prior.ids))[row] * lateness(flights, row, config)
