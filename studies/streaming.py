@@ -59,7 +59,7 @@ def run(args):
         changes(args)
         return
     columns = "set", "tape off by [m]", "in use after piece", "third piece, given", "in use"
-    columns += "other flights, given", "in use", "worst piece, ratio"
+    columns += "other flights, given", "in use", "worst piece, ratio", "changes named"
     cli.show(table.head(*columns))
     rows = [(name, std) for name in table.chosen(args, SETS) for std in args.tape]
     for (name, std), draws in table.trials(partial(drawn, args.data), rows, args):
@@ -73,7 +73,7 @@ def flights_of(name, data):
 
 
 def drawn(data, trial):
-    """Figures of a trial ((set, standard deviation m), seed): [(flight, given m, in use m, taken)]."""
+    """Figures of a trial ((set, standard deviation m), seed): [(flight, given m, in use m, taken, whether a change is named)]."""
     (name, std), seed = trial
     true = flights_of(name, data)
     noise = np.random.default_rng(seed).standard_normal(true[0].anchors.positions.shape)
@@ -89,7 +89,7 @@ def drawn(data, trial):
             errors = [_rmse(flight, known[k], piece) for k in (0, now)]
             step = calibration.take(piece)
             if piece.duration > FEWEST_SECONDS:
-                out.append((number, *errors, step.taken))
+                out.append((number, *errors, step.taken, _names_a_change(step)))
     return out
 
 
@@ -165,8 +165,12 @@ def _taken(flights, calibration, settled=-np.inf):
             if flight is flights[-1] and piece.start >= settled:
                 errors.append(_rmse(flight, _odometry(flight, calibration.effects), piece))
             step = calibration.take(piece)
-            named += step.taken and "anchor" in step.text
+            named += _names_a_change(step)
     return _mean(errors), named
+
+
+def _names_a_change(step):
+    return step.taken and "anchor" in step.text
 
 
 def _mean(errors):
@@ -197,4 +201,5 @@ def _summary(draws):
     ratios = [row[2] / row[1] for one in draws for row in one]
     when = f"{np.median(begun):g} ({len(begun)} of {len(draws)})" if begun else "never"
     means = [f"{value:.3f}" for value in (*third.mean(axis=0), *np.nanmean(others, axis=0))]
-    return [when, *means, f"{np.nanmax(ratios):.2f}"]
+    named = sum(row[4] for one in draws for row in one)
+    return [when, *means, f"{np.nanmax(ratios):.2f}", named]

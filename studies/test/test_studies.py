@@ -180,8 +180,13 @@ KNOWN = [  # words, module, its function that is replaced, by what, what is prin
         "streaming --data . --only const1 --tape 0.1",
         streaming,
         "drawn",
-        [(0, 0.2, 0.2, False), (0, 0.2, 0.2, True), (0, 0.2, 0.1, False), (1, 0.2, 0.21, True)],
-        "| const1 | 0.1 | 2 (1 of 1) | 0.200 | 0.100 | 0.200 | 0.210 | 1.05 |",
+        [
+            (0, 0.2, 0.2, False, False),
+            (0, 0.2, 0.2, True, False),
+            (0, 0.2, 0.1, False, False),
+            (1, 0.2, 0.21, True, True),
+        ],
+        "| const1 | 0.1 | 2 (1 of 1) | 0.200 | 0.100 | 0.200 | 0.210 | 1.05 | 1 |",
     ),
     (
         "streaming --data . --only const1 --tape 0.1 --changed",

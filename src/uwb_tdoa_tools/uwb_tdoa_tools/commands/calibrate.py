@@ -29,7 +29,7 @@ Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and 
 lines that start the nodes. --quick predicts within a minute what that gains, with ground truth or without, and writes nothing.
 A flight in which `check` finds an error is left out, and named with the rule; --keep uses it all the same.
 
---stream calibrates as if the flights were heard one after the other, without their ground truth: in pieces of 45 s, each of which
+--stream calibrates as if the flights were heard one after the other, without their ground truth: in pieces of 35 s, each of which
 judges what the pieces before it have found. It prints a line for each piece, and writes the last calibration that was in use.
 
 Exit code: 0 calibrated, or predicted (--quick), 1 stopped, 2 bad input."""

@@ -24,7 +24,7 @@ from ..diagnosis.self_calibration.equations import slow_innovations
 from ..diagnosis.self_calibration.prior import with_calibration
 from ..diagnosis.self_calibration.solve import LEFT, AnchorChange
 
-PIECE = 45.0  # s; a solution needs 30 s of motion
+PIECE = 35.0  # s; a solution needs 30 s of motion, and a change three pieces at most
 # Smallest ratio of the slow innovations without and with a first calibration on data that was not used,
 # and of those after and before a change of the anchors
 SMALLEST_RATIO = 1.5
