@@ -31,6 +31,7 @@ SMALLEST_RATIO = 1.5
 # Pieces whose median shows what the calibration in use leaves: after half as many it is what is left
 # after a change that nothing explains
 MOST_LEVELS = 8
+MOST_CHANGED = 2  # anchors at once; changes of more explain a piece, but are seldom the true ones
 MOST_WAITING = 4  # pieces with little motion that one solution joins
 
 
@@ -93,8 +94,8 @@ class StreamCalibration:
         except InputError as error:
             return Step(piece.name, piece.start, piece.end, np.nan, np.nan, False, str(error))
         changed = bool(before > SMALLEST_RATIO * self._level)
-        text, after = "nothing to judge yet", np.nan
-        taken = False
+        refusals: list[str] = []
+        text, after, taken = "nothing to judge yet", np.nan, False
         for candidate in self._candidates:
             try:
                 effects = with_calibration(
@@ -102,10 +103,14 @@ class StreamCalibration:
                 )
                 after = self._slow(piece, effects)
                 why_not = candidate.why_not or self._reason_against(changed, before, after)
+                if len({change.anchor for change in _changes(candidate)}) > MOST_CHANGED:
+                    why_not = f"more than {MOST_CHANGED} anchors have changed: survey them again"
             except InputError as error:  # these anchors give no estimate
                 why_not = str(error)
-            text = f"not taken: {why_not}"
-            if why_not is None:
+            if why_not is not None:
+                refusals.append(why_not)
+                text = f"not taken: {refusals[0]}"
+            else:
                 self.effects, self.number, taken = effects, self.number + 1, True
                 changes = [change.as_text() for change in _changes(candidate)]
                 text = "; ".join([f"calibration {self.number} is in use", *changes])
@@ -126,14 +131,13 @@ class StreamCalibration:
         flights = [replace(one, anchors=anchors) for one in self._waiting]
         # an unknown anchor is placed once
         tape = replace(self._tape, unknown=()) if self.number else self._tape
-        steady = replace(tape, steady=True)
-        tries = [(tape if base.covariance is None else steady, base)]
-        if changed:  # a single anchor, or all
-            tries = [(tape, base), (steady, replace(base, covariance=None))]
         text = ""
-        for one, known in tries:
+        # a change of single anchors is judged first
+        for steady in [False] * changed + [base.covariance is not None]:
             try:
-                self._candidates.append(self_calibrate(flights, one, known, self._config))
+                self._candidates.append(
+                    self_calibrate(flights, replace(tape, steady=steady), base, self._config)
+                )
             except InputError as error:
                 text = f"; no new solution: {error}"
         self._waiting = [] if self._candidates else self._waiting
