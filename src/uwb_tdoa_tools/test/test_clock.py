@@ -129,6 +129,15 @@ def test_a_pause_is_named_and_moves_nothing():
     assert not straightened(stamps, arrived).jumps
 
 
+def test_a_stamp_that_is_no_number_is_no_jump():
+    stamps = stamps_of()
+    arrived = {name: t + 0.01 for name, t in stamps.items()}
+    stamps["tdoa"][[300, 500, 503]] = np.nan
+    stamps["tdoa"][310] += 50.0
+    found = straightened(stamps, arrived)
+    assert not found.jumps and found.outliers == {"tdoa": 1}
+
+
 def test_a_silent_stream_is_not_changed():
     stamps = stamps_of(60.0)
     stamps["tdoa"] = stamps["tdoa"][(stamps["tdoa"] < 20.0) | (stamps["tdoa"] > 45.0)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -82,6 +83,11 @@ class Jump(NamedTuple):
     at: float
     period: str = ""
 
+    @property
+    def leads(self) -> bool:
+        """Return whether a stream jumped whose clock restarts the filter."""
+        return not set(self.streams).isdisjoint(LEADING)
+
 
 @dataclass(frozen=True)
 class Straightened:
@@ -137,31 +143,30 @@ def straightened(
         {stream: (n,) s, when the messages were recorded, NaN where unknown}.
     """
     found = {name: _Stream(name, t, (arrived or {}).get(name)) for name, t in stamps.items()}
-    ends = {name: stream.end for name, stream in found.items() if stream.steady}
+    ends = {name: float(stream.t[-1]) for name, stream in found.items() if stream.steady}
     for name, stream in found.items():
         stream.cut([end for other, end in ends.items() if other != name])
-    groups = _groups([stream for stream in found.values() if stream.breaks])
-    jumps = [jump for jump in (_of_group(group, found) for group in groups) if jump is not None]
+    groups = [(_of_group(group, found), group) for group in _groups([*found.values()])]
     for stream in found.values():
         _join_late(stream, found)
-    shifts = {name: of for name, stream in found.items() if (of := stream.shifts()) is not None}
-    whole = {name: t + shifts.get(name, 0.0) for name, t in stamps.items()} if jumps else {}
+    shifts = {name: stream.shift() for name, stream in found.items()}
+    whole = {name: t + shifts[name] for name, t in stamps.items()}
     begin = min(
-        (float(np.min(t[found[name].kept], initial=np.inf)) for name, t in whole.items()),
-        default=0.0,
+        (np.min(t[found[name].kept], initial=np.inf) for name, t in whole.items()), default=0.0
     )
-    done = []
-    for named, members in jumps:
-        at = min(float(whole[stream.name][of.first]) for stream, of in members)
-        done.append(named._replace(at=at, after=at - begin))
-    done.sort(key=lambda jump: jump.at)
-    restarts = [
-        jump.at
-        for jump in done
-        if jump.kind == RESTART and not set(jump.streams).isdisjoint(LEADING)
-    ]
-    kept = {name: stream.kept for name, stream in found.items() if not stream.kept.all()}
-    return Straightened(shifts, kept, tuple(done), tuple(sorted(set(restarts))))
+    jumps = []
+    for jump, group in groups:
+        at = min(float(whole[stream.name][stream.place[one.first]]) for stream, one in group)
+        if jump is not None:
+            jumps.append(jump._replace(at=at, after=at - float(begin)))
+    jumps.sort(key=lambda jump: jump.at)
+    restarts = {jump.at for jump in jumps if jump.kind == RESTART and jump.leads}
+    return Straightened(
+        {name: shift for name, shift in shifts.items() if shift.any()},
+        {name: stream.kept for name, stream in found.items() if not stream.kept.all()},
+        tuple(jumps),
+        tuple(sorted(restarts)),
+    )
 
 
 def is_grouped(t: np.ndarray, *ids: np.ndarray) -> bool:
@@ -187,7 +192,7 @@ def is_grouped(t: np.ndarray, *ids: np.ndarray) -> bool:
 class _Break:
     """Place where the time of a stream jumps.
 
-    first, last : places of the message after and of the last one before; by : s, of the clock;
+    first, last : numbers of the stamp after and of the last one before; by : s, of the clock;
     sure : false if the stream may also have been silent.
     """
 
@@ -199,37 +204,33 @@ class _Break:
 
 
 class _Stream:
-    """Stamps t (n,) s of one stream, in the order of the file, with its breaks.
+    """Finite stamps t (m,) s of one stream, in the order of the file, with its breaks.
 
-    arrived : (n,) s or None; steady : whether the stamps have neither jumps nor pauses.
+    place : (m,) in the file; kept : (n,) bool, of all messages; arrived : (m,) s or None; steady :
+    whether the stamps have neither jumps nor pauses.
     """
 
     def __init__(self, name: str, t: np.ndarray, arrived: np.ndarray | None) -> None:
-        self.name, self.t = name, t
-        self.kept = np.ones(len(t), bool)
+        self.place = np.flatnonzero(np.isfinite(t))
+        self.name, self.t, self.kept = name, t[self.place], np.ones(len(t), bool)
         self.breaks: list[_Break] = []
         self.offset = 0.0  # s, added to every stamp
-        self.finite = np.flatnonzero(np.isfinite(t))
-        steps = np.diff(t[self.finite])
+        # Arrivals count if they are known and never fall.
+        known = arrived is not None and (np.diff(arrived, prepend=-np.inf) >= 0.0).all()
+        self.arrived = arrived[self.place] if arrived is not None and known else None
+        steps = np.diff(self.t)
         rising = steps[steps > 0.0]
         self.usual = float(np.median(rising)) if len(rising) else 0.0  # s
         self.limit = max(AHEAD, SLOW * self.usual)
-        # Arrivals count if they are known and never fall.
-        known = arrived is not None and bool(
-            np.isfinite(arrived).all() and (np.diff(arrived) >= 0.0).all()
-        )
-        self.arrived = arrived if known else None
+        self.steady = len(self.t) > 0 and self._follows(steps).all()
         # Steps forward count too: they lead back from a wild stamp.
         forward = steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
-        far = (steps < -LARGEST_STEP_BACK) | forward
-        self._edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(self.finite)]])
-        self.steady = bool(
-            len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all()
-        )
+        far = np.flatnonzero((steps < -LARGEST_STEP_BACK) | forward) + 1
+        self._pieces = list(zip([0, *far.tolist()], [*far.tolist(), len(self.t)]))
 
-    @property
-    def end(self) -> float:
-        return float(self.t[self.finite[-1]])
+    def _follows(self, step: np.ndarray | float) -> np.ndarray:
+        """Return whether steps, s, are usual of messages that follow each other."""
+        return np.asarray((-LARGEST_STEP_BACK <= step) & (step <= self.limit))
 
     def cut(self, ends: Sequence[float]) -> None:
         """Find the breaks and the outliers.
@@ -239,177 +240,127 @@ class _Stream:
 
         ends : s, last stamps of other streams that are steady
         """
-        few = min(FEW, max(2, len(self.finite) // 20))
-        pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))  # of `finite`
-        if len(pieces) == 1:
+        if len(self._pieces) == 1:
             return
-        last = -1  # place of the last accepted message; -1 before the first
+        last = -1  # the last accepted stamp; -1 before the first
         breaks, kept = list[_Break](), self.kept.copy()
-        for number, (begin, end) in enumerate(pieces):
-            first = int(self.finite[begin])
-            following = pieces[number + 1][0] if number + 1 < len(pieces) else None
-            many = self._lasts(pieces[number:], few, last)
+        for number, (first, end) in enumerate(self._pieces):
+            later = self.t[[begin for begin, _ in self._pieces[number + 1 : number + 4]]]
+            many = self._lasts(self._pieces[number:], last)
             if last < 0:  # the first messages may be outliers, too
-                accepted = many or any(
-                    self._follows(end - 1, piece[0]) for piece in pieces[number + 1 : number + 4]
-                )
-            elif self._continues(last, first, following, ends, many):
-                accepted = True
+                continues = bool(self._follows(later - self.t[end - 1]).any())
             else:
-                accepted = many
-                if many:
-                    breaks.append(
-                        _Break(
-                            first,
-                            last,
-                            self._size(last, first),
-                            self._sure(last, first, following, ends),
-                        )
-                    )
-            if accepted:
-                last = int(self.finite[end - 1])
+                sure = self._is_sure(last, first, later, ends)
+                continues = self._continues(last, first, later, ends, many, sure)
+                if many and not continues:
+                    by = min(self._ahead(last, first, NEAR), float(self.t[first] - self.t[last]))
+                    breaks.append(_Break(first, last, by, sure))
+            if many or continues:
+                last = end - 1
             else:
-                kept[self.finite[begin:end]] = False
+                kept[self.place[first:end]] = False
         outliers = np.count_nonzero(~kept)
-        if last < 0 or len(breaks) > max(10, MOST * len(self.t)) or outliers > 0.1 * len(self.t):
+        if last < 0 or len(breaks) > max(10, MOST * len(kept)) or outliers > 0.1 * len(kept):
             return  # no clock explains that: the stamps stay as they are
         self.breaks, self.kept = breaks, kept
 
-    def _follows(self, before: int, after: int) -> bool:
-        """Return whether the message at place `after` of `finite` may follow that at `before`."""
-        return bool(
-            -LARGEST_STEP_BACK
-            <= self.t[self.finite[after]] - self.t[self.finite[before]]
-            <= self.limit
-        )
-
-    def _lasts(self, pieces: Sequence[tuple[int, int]], few: int, last: int) -> bool:
+    def _lasts(self, pieces: Sequence[tuple[int, int]], last: int) -> bool:
         """Return whether the first piece, with the pieces that continue it, has many messages.
 
-        Pieces that belong to the time of the message at `last` are not counted.
+        Pieces that belong to the time of the stamp `last` are not counted.
         """
-        count, behind = 0, pieces[0][1] - 1
-        for begin, end in pieces:
-            if count and not self._follows(behind, begin):
+        few, t = min(FEW, max(2, len(self.t) // 20)), self.t
+        (start, behind), *more = pieces
+        count = behind - start
+        for begin, end in more:
+            back = last >= 0 and t[start] < t[last] <= t[begin]
+            if count >= few or back or not self._follows(t[begin] - t[behind - 1]):
                 break
-            if (
-                count
-                and last >= 0
-                and self.t[self.finite[pieces[0][0]]] < self.t[last] <= self.t[self.finite[begin]]
-            ):
-                break  # back in time
-            count, behind = count + end - begin, end - 1
-            if count >= few:
-                return True
-        return False
+            count, behind = count + end - begin, end
+        return count >= few
 
     def _continues(
-        self, last: int, first: int, following: int | None, ends: Sequence[float], many: bool
+        self,
+        last: int,
+        first: int,
+        later: np.ndarray,
+        ends: Sequence[float],
+        many: bool,
+        sure: bool,
     ) -> bool:
-        """Return whether the message at `first` continues the time of the one at `last`."""
+        """Return whether the stamp `first`, of many or few, continues the time of the stamp `last`."""
         t, step = self.t, self.t[first] - self.t[last]
         if step < -LARGEST_STEP_BACK:
             return False
         if self.arrived is not None:
-            ahead = (
-                self._by_arrival(last, first)
-                if many
-                else step - float(self.arrived[first] - self.arrived[last])
-            )
-            return bool(ahead < LARGEST_STEP_BACK)
+            return self._ahead(last, first, NEAR if many else 1) < LARGEST_STEP_BACK
         if step <= self.limit:
             return True
         if many:
-            others_continued = any(end > t[last] + self.limit for end in ends) and step <= PAUSE
-            return others_continued and not self._sure(last, first, following, ends)
-        if following is None:
+            others_continued = any(end > t[last] + self.limit for end in ends)
+            return others_continued and step <= PAUSE and not sure
+        if not len(later):
             return any(end + self.limit > t[first] for end in ends)
-        return (
-            step <= PAUSE
-            and -LARGEST_STEP_BACK <= float(self.t[self.finite[following]] - self.t[first]) <= PAUSE
-        )
+        return bool(step <= PAUSE and -LARGEST_STEP_BACK <= later[0] - t[first] <= PAUSE)
 
-    def _falls(self, first: int, following: int | None) -> bool:
-        return following is not None and bool(
-            self.t[self.finite[following]] < self.t[first] - LARGEST_STEP_BACK
-        )
-
-    def _sure(self, last: int, first: int, following: int | None, ends: Sequence[float]) -> bool:
+    def _is_sure(self, last: int, first: int, later: np.ndarray, ends: Sequence[float]) -> bool:
         """Return whether a step between two messages certainly comes from the clock.
 
         Three cases are certain: the arrivals show it, the stamps fall back soon, or the stream ends with
         others only without the step.
         """
-        step = float(self.t[first] - self.t[last])
-        if self.arrived is not None or step < 0.0 or self._falls(first, following):
-            return True
-        without = any(abs(self.end - step - end) < TOGETHER for end in ends)
-        return without and not any(abs(self.end - end) < 0.5 * step for end in ends)
+        step, off = float(self.t[first] - self.t[last]), self.t[-1] - np.array(ends)
+        falls = step < 0.0 or bool((later[:1] < self.t[first] - LARGEST_STEP_BACK).any())
+        without = (abs(off - step) < TOGETHER).any() and not (abs(off) < 0.5 * step).any()
+        return self.arrived is not None or falls or bool(without)
 
-    def _by_arrival(self, last: int, first: int) -> float:
-        """Return the size of a jump of the clock, s, from the arrivals on both sides."""
-        assert self.arrived is not None
+    def _ahead(self, last: int, first: int, near: int) -> float:
+        """Return the size of a jump of the clock, s.
+
+        It is known from the arrivals of the `near` messages on both sides, or from the usual step.
+        """
+        if self.arrived is None:
+            return float(self.t[first] - self.t[last]) - self.usual
         ahead = self.t - self.arrived
-        return float(
-            np.median(ahead[first : first + NEAR])
-            - np.median(ahead[max(0, last + 1 - NEAR) : last + 1])
-        )
+        before = np.median(ahead[max(0, last + 1 - near) : last + 1])
+        return float(np.median(ahead[first : first + near]) - before)
 
-    def _size(self, last: int, first: int) -> float:
-        step = float(self.t[first] - self.t[last])
-        return (
-            min(step, self._by_arrival(last, first))
-            if self.arrived is not None
-            else step - self.usual
-        )
-
-    def shifts(self) -> np.ndarray | None:
-        """Return (n,) s to add to the stamps; None without a shift."""
-        if not self.offset and not any(one.shift for one in self.breaks):
-            return None
-        out = np.full(len(self.t), self.offset)
+    def shift(self) -> np.ndarray:
+        """Return (n,) s to add to the stamps."""
+        out = np.full(len(self.kept), self.offset)
         for one in self.breaks:
-            out[one.first :] += one.shift
+            out[self.place[one.first] :] += one.shift
         return out
 
-    def runs(self) -> Iterator[tuple[float, float, float]]:
-        """Yield (first and last stamp s, shift s) of each time of the stream."""
-        begin, shift = int(self.finite[0]) if len(self.finite) else 0, self.offset
-        for one in self.breaks:
-            yield float(self.t[begin]), float(self.t[one.last]), shift
-            begin, shift = one.first, shift + one.shift
-        if len(self.finite):
-            yield float(self.t[begin]), self.end, shift
+
+_Member = tuple[_Stream, _Break]
 
 
-def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
+def _groups(streams: list[_Stream]) -> Iterator[list[_Member]]:
     """Yield the breaks of several streams that are one jump of their clock.
 
     The first stream is the quickest of LEADING, or of all if none of LEADING jumped.
     """
-    left = {stream.name: list(stream.breaks) for stream in streams}
-    for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
-        while left[stream.name]:
-            one = left[stream.name][0]
-            group = [(stream, one)]
-            left[stream.name].remove(one)
-            for other in (other for other in streams if other is not stream):
-                for its in left[other.name]:
-                    near = (
-                        abs(its.by - one.by) < TOGETHER
-                        and abs(other.t[its.last] - stream.t[one.last]) < TOGETHER + other.usual
-                    )
-                    if near:
-                        group.append((other, its))
-                        left[other.name].remove(its)
-                        break
-            yield group
+    ordered = sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual))
+    left = [(stream, one) for stream in ordered for one in stream.breaks]
+    while left:
+        stream, one = left[0]
+        group = [left[0]]
+        for other in streams:
+            near = (
+                (of, its)
+                for of, its in left
+                if of is other is not stream
+                and abs(its.by - one.by) < TOGETHER
+                and abs(of.t[its.last] - stream.t[one.last]) < TOGETHER + of.usual
+            )
+            group += islice(near, 1)
+        left = [member for member in left if member not in group]
+        yield group
 
 
-def _of_group(
-    group: list[tuple[_Stream, _Break]], every: Mapping[str, _Stream]
-) -> tuple[Jump, list[tuple[_Stream, _Break]]] | None:
-    """Return (Jump of one clock, group), and shift its streams; None for a silence of some streams.
+def _of_group(group: list[_Member], every: Mapping[str, _Stream]) -> Jump | None:
+    """Return the Jump of one clock, and shift its streams; None for a silence of some streams.
 
     Two fields of the Jump are NaN until `straightened` knows all shifts.
     """
@@ -434,23 +385,22 @@ def _of_group(
     # while a leading stream goes on, a silence of others is no event of the clock
     if kind == SILENCE and not {name for name in every if name in LEADING} <= set(names):
         return None
-    return Jump(kind, names, one.first + 1, np.nan, by, np.nan, period), group
+    return Jump(kind, names, int(stream.place[one.first]) + 1, np.nan, by, np.nan, period)
 
 
 def _join_late(stream: _Stream, every: Mapping[str, _Stream]) -> None:
     """Shift a stream without a break that has only messages after a jump of the other streams."""
-    if stream.breaks or not len(stream.finite):
+    if stream.breaks or not len(stream.t):
         return
-    first, last = float(stream.t[stream.finite[0]]), stream.end
     for other in every.values():
+        firsts = [0, *(one.first for one in other.breaks)]  # of each time of its clock
+        lasts = [*(one.last for one in other.breaks), -1]
         if other.breaks:
-            fits = [
-                shift
-                for begin, end, shift in other.runs()
-                if begin - TOGETHER <= first and last <= end + TOGETHER
-            ]
-            if len(fits) == 1:
-                stream.offset = fits[0]
+            fits = (other.t[firsts] - TOGETHER <= stream.t[0]) & (
+                stream.t[-1] <= other.t[lasts] + TOGETHER
+            )
+            if np.count_nonzero(fits) == 1:
+                stream.offset = float(other.shift()[other.place[firsts]][fits][0])
                 return
 
 
@@ -478,8 +428,7 @@ def in_words(jump: Jump) -> tuple[str, str]:
     if jump.kind == WRAP:
         return f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}", shifted
     if jump.kind == RESTART:
-        leads = not set(jump.streams).isdisjoint(LEADING)
-        restart = ", and the filter starts anew there" if leads else ""
+        restart = ", and the filter starts anew there" if jump.leads else ""
         return (
             f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}",
             shifted + restart,
