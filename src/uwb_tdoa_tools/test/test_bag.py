@@ -239,7 +239,7 @@ def test_stamps_that_ros_cannot_hold(tmp_path, stamp):
 
 
 def test_unknown_storage_and_empty_flight(tmp_path):
-    with pytest.raises(InputError, match="'zip' is not known; choose one of mcap, sqlite3"):
+    with pytest.raises(InputError, match="'zip' is not one of mcap, sqlite3"):
         write_bag(small_flight(0.05), tmp_path / "flight", "zip")
     none = np.empty(0)
     with pytest.raises(InputError, match="holds no message"):

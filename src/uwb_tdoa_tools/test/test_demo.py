@@ -36,7 +36,7 @@ from uwb_tdoa_tools.simulation.config import corners
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0."),
+        (["--rate", "0"], "argument --rate: '0' is not a number above 0"),
         (
             ["--survey", "survey.txt"],
             "--survey: needs --flight; a simulated flight has its own anchors.",

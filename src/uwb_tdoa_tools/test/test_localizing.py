@@ -380,4 +380,4 @@ def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     )
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)
-    assert "--zones: 0 m is no size" in capsys.readouterr().err
+    assert "--zones: '0' is not a number above 0" in capsys.readouterr().err

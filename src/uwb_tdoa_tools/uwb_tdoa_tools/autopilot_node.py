@@ -21,7 +21,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.ros.cdr import CdrCodec
 from uwb_tdoa_bias.ros.node import (
@@ -133,9 +133,7 @@ class AutopilotNode(StreamNode):
     def _open(self, own: dict[str, Any]) -> Link:
         """Return the Link that the parameters ask for."""
         protocol, streams = own["protocol"], [name for name in own["log"] if name]
-        unknown = sorted(set(streams) - set(TOPICS))
-        if unknown:
-            raise InputError(f"log: {unknown[0]!r} is not one of {', '.join(TOPICS)}.")
+        refuse_others("log", streams, TOPICS)
         if streams and protocol != CRAZYFLIE:
             raise InputError("log: only a Crazyflie has log blocks; set protocol to crazyflie.")
         if protocol == MAVLINK:

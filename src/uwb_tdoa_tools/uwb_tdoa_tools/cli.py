@@ -31,7 +31,14 @@ from typing import Any, TextIO, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import Failure, InputError, line_of, printable, written_by
+from uwb_tdoa_bias.common.errors import (
+    Failure,
+    InputError,
+    line_of,
+    number_of,
+    printable,
+    written_by,
+)
 from uwb_tdoa_bias.common.executable import COMPILING
 from uwb_tdoa_bias.common.files import protected_inputs, refuse_output, write_text
 
@@ -228,6 +235,14 @@ def _fail(name: str, sentence: object, code: int) -> int:
 
 class Output(type(Path())):  # type: ignore[misc]  # the kind of path of this system: Path itself has no subclasses before Python 3.12
     """Path of an output."""
+
+
+def positive(text: str) -> float:
+    """Return a finite number above 0, for argparse."""
+    value = number_of(text)
+    if not 0.0 < value < np.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value
 
 
 class OutputFile(Output):

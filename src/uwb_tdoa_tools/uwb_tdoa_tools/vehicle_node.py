@@ -24,7 +24,7 @@ from builtin_interfaces.msg import Duration as DurationMessage
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES
 from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 from uwb_tdoa_bias.ros.node import (
@@ -113,9 +113,7 @@ class VehicleNode(StreamNode):
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
         self._mission, sensors = own["mission"], [name for name in own["sensors"] if name]
-        unknown = sorted(set(sensors) - set(SENSOR_NAMES))
-        if unknown:
-            raise InputError(f"sensors: {unknown[0]!r} is not one of {', '.join(SENSOR_NAMES)}.")
+        refuse_others("sensors", sensors, SENSOR_NAMES)
         drives = own["vehicle"] == "rover"
         if drives and (sensors or not self._mission):
             raise InputError(

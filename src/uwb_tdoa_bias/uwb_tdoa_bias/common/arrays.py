@@ -28,6 +28,14 @@ class Stamped:
         return len(self.t)
 
 
+def numbers_of(values: Any) -> np.ndarray:
+    """Return a list of numbers, or of lists of them, as an array; one NaN, (1,), if it is none."""
+    try:
+        return np.array(values, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        return np.array([np.nan])
+
+
 class SymbolicArray(ABC):
     """An array of symbols, one row per measurement, that records what is computed of it."""
 

@@ -13,11 +13,22 @@ the need: a log of an hour has 300 MB, the project's YAML files have some kB, mo
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import cache
+import math
 from pathlib import Path
 import re
 import time
+from typing import Any
+
+
+def number_of(value: Any) -> float:
+    """Return a value or text as a number, NaN if it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 class InputError(ValueError):
@@ -25,6 +36,14 @@ class InputError(ValueError):
 
     The message is one sentence that names the field, the value and the remedy. Exit code 2.
     """
+
+
+def refuse_others(where: str | Path, values: Iterable[Any], known: Iterable[str]) -> None:
+    """Raise InputError for the first of some values that is not known."""
+    names = [*known]
+    other = [value for value in values if value not in names]
+    if other:
+        raise InputError(f"{where}: {repr(other[0])[:60]} is not one of {', '.join(names)}.")
 
 
 class Failure(Exception):

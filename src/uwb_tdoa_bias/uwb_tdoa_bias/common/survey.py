@@ -15,7 +15,7 @@ import numpy as np
 
 from .anchors import FARTHEST, GEODETIC, UNITS, Anchors, refuse_faulty
 from .arrays import rotations
-from .errors import SURVEY_BYTES, InputError
+from .errors import SURVEY_BYTES, InputError, number_of
 from .files import read_bytes
 from .safe_yaml import parse_yaml
 
@@ -388,10 +388,7 @@ def _number(value: Any) -> float:
         if isinstance(value, str) and _COMMA.match(value.strip())
         else value
     )
-    try:
-        number = float(text)
-    except (ValueError, OverflowError):
-        return math.nan
+    number = number_of(text)
     return number if math.isfinite(number) else math.nan
 
 

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ..common.anchors import Anchors
-from ..common.errors import InputError
+from ..common.errors import InputError, number_of
 from ..common.flight import Flight
 from ..common.sensors import STREAM_OF, measured_on
 from .samples import (
@@ -274,10 +274,7 @@ class Effect:
             for key, value in (getattr(self, group) or {}).items():
                 key = str(key)
                 self.check_key(key)
-                try:
-                    read[key] = float(value)
-                except (TypeError, ValueError):
-                    read[key] = np.nan
+                read[key] = number_of(value)
                 bound = self.bound_of(key)
                 if not np.isfinite(read[key]) or abs(read[key]) > bound:
                     raise InputError(

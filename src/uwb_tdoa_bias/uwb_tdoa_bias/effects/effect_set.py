@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from ..common.anchors import Anchors
-from ..common.errors import InputError, written_by
+from ..common.errors import InputError, refuse_others, written_by
 from ..common.files import write_text
 from ..common.flight import SENSOR_NAMES, STREAMS, Flight
 from ..common.safe_yaml import read_yaml
@@ -380,15 +380,8 @@ class EffectSet:
                 raise InputError(f"{path}: effect {name!r} is not known; known are {known}.")
             allowed = (*ENTRY, *kind.settings)
             entry = entry or {}
-            unknown = (
-                set(map(str, entry)) - set(allowed)
-                if isinstance(entry, dict)
-                else {"(not a mapping)"}
-            )
-            if unknown:
-                raise InputError(
-                    f"{path}: {name}: {sorted(unknown)[0]!r} is not one of {', '.join(allowed)}."
-                )
+            given = map(str, entry) if isinstance(entry, dict) else ["(not a mapping)"]
+            refuse_others(f"{path}: {name}", given, allowed)
             try:
                 effects.append(kind(**entry))
             except (TypeError, AttributeError) as error:

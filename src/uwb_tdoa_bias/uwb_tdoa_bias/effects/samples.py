@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Protocol, TypeVar, cast
 import numpy as np
 
 from ..common.anchors import Anchors
-from ..common.arrays import Stamped, filled, floats, rotations
+from ..common.arrays import Stamped, filled, floats, numbers_of, rotations
 from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.flight import Flight
@@ -625,10 +625,8 @@ def checked_domain(effect: str, domain: Any) -> dict[str, tuple[float, float]]:
     known = (*OF_TDOA, *OF_ARRIVAL, *OF_IMU)
     for covariate, limits in (domain or {}).items():
         name = str(covariate)
-        try:
-            low, high = map(float, limits)
-        except (TypeError, ValueError):
-            low = high = np.nan
+        found = numbers_of(limits)
+        low, high = found.tolist() if found.shape == (2,) else (np.nan, np.nan)
         if name not in known or not has_domain(name) or not -np.inf < low <= high < np.inf:
             raise InputError(
                 f"effects: {effect}: domain: {covariate}: {limits!r}; expected a covariate "

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.anchors import Anchors
-from ..common.arrays import floats, interpolate, piecewise
+from ..common.arrays import floats, interpolate, numbers_of, piecewise
 from ..common.errors import InputError
 from ..common.sensors import BY_POSE, COMPARED
 from .base import (
@@ -470,10 +470,7 @@ def _check(setting: str, value: str, known: Collection[str]) -> None:
 
 def _rising(setting: str, knots: Any, shape: str) -> tuple[float, ...]:
     """Return the knots of a shape as a tuple; raise InputError if they are none."""
-    try:
-        out = tuple(float(knot) for knot in knots)
-    except (TypeError, ValueError):
-        out = ()
+    out = tuple(np.atleast_1d(numbers_of(knots)).tolist())
     count = SHAPES[shape][0] if shape in SHAPES else None
     if len(out) != (count or max(len(out), 2)) or not (np.diff(out) > 0.0).all():
         expected = count or "two or more"

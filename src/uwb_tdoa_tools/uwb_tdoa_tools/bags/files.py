@@ -37,6 +37,7 @@ from uwb_tdoa_bias.common.errors import (
     InputError,
     TooMuch,
     most_unpacked,
+    refuse_others,
 )
 from uwb_tdoa_bias.common.files import refuse_output, temporary_folder
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
@@ -489,8 +490,7 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
     force : whether to replace an existing bag. Raises InputError.
     """
     out = Path(out)
-    if storage not in STORAGES:
-        raise InputError(f"storage: {storage!r} is not known; choose one of {', '.join(STORAGES)}.")
+    refuse_others("storage", [storage], STORAGES)
     check_output(out, force)
     out.parent.mkdir(parents=True, exist_ok=True)
     # A folder next to `out`, so the last step is a rename. The bag in it has its final name, because

@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from functools import partial
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, command_lines, options
-from ..cli import OutputFile, option
+from ..cli import OutputFile, option, positive
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -54,7 +53,7 @@ def parser() -> ArgumentParser:
             option(
                 "--live",
                 metavar="S",
-                type=float,
+                type=positive,
                 help="listen to live topics for S seconds instead",
             ),
             option("--json", metavar="FILE", type=OutputFile, help="write all findings"),
@@ -70,8 +69,6 @@ def _check(args: Namespace) -> int:
 
     if bool(args.flights) == (args.live is not None):
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
-    if args.live is not None and not 0.0 < args.live < math.inf:
-        raise InputError(f"--live: {args.live:g} must be a number of seconds above 0, e.g. 60.")
     reading, estimator = options.reading_of(args), FlightEstimator(*options.filter_of(args))
     surveys = Path(args.survey) if args.survey else None
     folder = sorted(surveys.glob("anchor_?*")) if surveys and surveys.is_dir() else []

@@ -7,10 +7,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 import json
-import math
 from pathlib import Path
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, number_of
 from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.common.flight import STREAMS
 
@@ -156,10 +155,7 @@ def _offsets(texts: list[str]) -> dict[str, float]:
     offsets: dict[str, float] = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
-        try:
-            offset = float(seconds)
-        except ValueError:
-            offset = math.nan
+        offset = number_of(seconds)
         if not given or sensor not in STREAMS or sensor in offsets or not abs(offset) < 1e11:
             raise InputError(
                 f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one "

@@ -13,7 +13,7 @@ import time
 from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
-from ..cli import OutputFile, OutputFolder, option
+from ..cli import OutputFile, OutputFolder, option, positive
 
 DESCRIPTION = """Find a systematic error of the measurements, write its correction, and fly with it.
 
@@ -56,7 +56,7 @@ def parser() -> ArgumentParser:
             option(
                 "--rate",
                 metavar="R",
-                type=float,
+                type=positive,
                 help=(
                     "replay R times as fast as flown (default 1; 20 of a simulated flight, or as fast as "
                     "this machine can)"
@@ -85,8 +85,6 @@ def parser() -> ArgumentParser:
 def _demo(args: Namespace) -> int:
     if args.rate is None:
         args.rate = RATES["measured" if args.flight else "simulated"]
-    if not 0.0 < args.rate < float("inf"):
-        raise InputError(f"--rate: {args.rate:g} is not a speed; give a number above 0.")
     if args.survey and not args.flight:
         raise InputError("--survey: needs --flight; a simulated flight has its own anchors.")
     if args.flight:

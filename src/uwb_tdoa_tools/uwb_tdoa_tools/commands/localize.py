@@ -7,10 +7,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from functools import partial
 
-from uwb_tdoa_bias.common.errors import InputError
-
 from .. import cli, options, parallel
-from ..cli import OutputFile, option
+from ..cli import OutputFile, option, positive
 
 DESCRIPTION = """Where the tag was: trajectories of recordings, without ground truth, which is not read.
 
@@ -53,7 +51,7 @@ def parser() -> ArgumentParser:
             option(
                 "--zones",
                 metavar="M",
-                type=float,
+                type=positive,
                 help="write who is heard in squares of that size, and how well, too: a table, and a map",
             ),
             option(
@@ -74,10 +72,6 @@ def _localize(args: Namespace) -> int:
     from ..localizing.localize import Localizer, all_good, check_names
 
     out = args.out
-    if args.zones is not None and not args.zones > 0.0:
-        raise InputError(
-            f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20."
-        )
     named = areas.read_areas(args.areas) if args.areas else {}
     say = partial(cli.say, "localize")
     estimator = options.estimator_of(args)

@@ -9,7 +9,7 @@ from functools import partial
 
 from .. import cli
 from ..choices import WAIT
-from ..cli import option
+from ..cli import option, positive
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
             option(
                 "-r",
                 "--rate",
-                type=_positive,
+                type=positive,
                 default=1.0,
                 help="times as fast as recorded (default 1)",
             ),
@@ -49,7 +49,7 @@ def parser() -> argparse.ArgumentParser:
             ),
             option(
                 "--clock",
-                type=_positive,
+                type=positive,
                 nargs="?",
                 const=40.0,
                 metavar="HZ",
@@ -57,7 +57,7 @@ def parser() -> argparse.ArgumentParser:
             ),
             option(
                 "--wait-matched",
-                type=_positive,
+                type=positive,
                 default=WAIT,
                 metavar="SECONDS",
                 help=f"wait at most this long until somebody subscribes, or fail (default {WAIT:g})",
@@ -120,16 +120,6 @@ def _replay(args: argparse.Namespace) -> int:
     for what, count in done.wrong.items():
         say(f"{count} {what}; the result is not that of the bag: look at /diagnostics{slower}")
     return int(bool(done.wrong) or not done.acknowledged)
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value
 
 
 main = cli.executable(_replay, parser, ros=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import chi2
 
+from uwb_tdoa_bias.common.arrays import numbers_of
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import write_picture, write_text
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
@@ -90,11 +91,7 @@ def read_areas(path: str | Path) -> Areas:
         raise InputError(f"{path}: no areas; write name: [[x, y], [x, y], [x, y]], in metres.")
     areas = {}
     for name, corners in content.items():
-        try:
-            areas[str(name)] = np.array(corners, dtype=float)
-        except (TypeError, ValueError):
-            areas[str(name)] = np.empty(0)
-        one = areas[str(name)]
+        one = areas[str(name)] = numbers_of(corners)
         if str(name) == PARKED:
             raise InputError(f"{path}: {name}: parked tags have this name; give the area another.")
         if one.ndim != 2 or one.shape[1] != 2 or len(one) < 3:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors, refuse_faulty
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, number_of
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.common.survey import Entry, NamedAnchors, as_named, name_of, named_anchors
 
@@ -629,10 +629,7 @@ def as_time(value: Any) -> float | None:
 
 def as_number(value: Any) -> float | None:
     """Return a finite number, with a decimal point or comma; None if a value is not one."""
-    try:
-        number = float(value.replace(",", ".") if isinstance(value, str) else value)
-    except (TypeError, ValueError):
-        return None
+    number = number_of(value.replace(",", ".") if isinstance(value, str) else value)
     return number if np.isfinite(number) else None
 
 

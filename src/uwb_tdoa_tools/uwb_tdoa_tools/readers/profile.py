@@ -8,7 +8,7 @@ profile = Profile.of_columns(parse_columns("time=t_ms:ms,anchor=id,range=dist:mm
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
@@ -17,7 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.errors import DEFINITION_BYTES, InputError, sanitize
+from uwb_tdoa_bias.common.errors import (
+    DEFINITION_BYTES,
+    InputError,
+    number_of,
+    refuse_others,
+    sanitize,
+)
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, TICK
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.survey import name_of
@@ -161,8 +167,8 @@ SHIPPED = Path(__file__).resolve().parent / "profiles"
 _AXES = {"body": ("flu", "frd"), "world": ("enu", "ned")}  # the first is ours
 _TEXTS = "topic", "type", "each", "tag"
 MOST_STARS = 4  # of a pattern; the time to compare it grows with each
-_KEYS = {"about", "sources", "types", "antenna"}
-_SOURCE = {*_TEXTS, *_AXES, "where", "columns"}
+_KEYS = "about", "sources", "types", "antenna"
+_SOURCE = *_TEXTS, *_AXES, "where", "columns"
 _NAME = re.compile(r"\{(\w+)\}")
 _COMPARISON = re.compile(r"(<=|>=|<|>)\s*(\S+)")
 _COMPARE = {
@@ -193,10 +199,7 @@ class Condition:
         """Return whether a value meets the condition."""
         if not self.comparison:
             return as_text(value) in self.values
-        try:
-            return bool(_COMPARE[self.comparison](float(value), self.limit))
-        except (TypeError, ValueError):
-            return False
+        return bool(_COMPARE[self.comparison](number_of(value), self.limit))
 
 
 @dataclass(frozen=True)
@@ -312,7 +315,7 @@ def load_profile(name: str | Path) -> Profile:
     content = read_yaml(path)
     if not isinstance(content, dict) or not isinstance(content.get("sources"), list):
         raise InputError(f"{path}: is no profile; write a list under sources (docs/recordings.md).")
-    _refuse_unknown(path, content, _KEYS)
+    refuse_others(path, content, _KEYS)
     sources = tuple(
         _source(f"{path}: source {number}", each)
         for number, each in enumerate(content["sources"], start=1)
@@ -328,18 +331,10 @@ def load_profile(name: str | Path) -> Profile:
     )
 
 
-def _refuse_unknown(where: str | Path, content: Mapping[Any, Any], known: set[str]) -> None:
-    for key in content:
-        if key not in known:
-            raise InputError(
-                f"{where}: {str(key)[:40]!r} is not known; known are {', '.join(sorted(known))}."
-            )
-
-
 def _source(where: str, content: Any) -> Source:
     if not isinstance(content, dict) or not isinstance(content.get("columns"), dict):
         raise InputError(f"{where}: needs columns: {{OURS: THEIRS}}; see docs/recordings.md.")
-    _refuse_unknown(where, content, _SOURCE)
+    refuse_others(where, content, _SOURCE)
     columns = {
         str(ours): parse_column(where, str(ours), str(theirs))
         for ours, theirs in content["columns"].items()
@@ -352,10 +347,7 @@ def _source(where: str, content: Any) -> Source:
         if value.count("*") > MOST_STARS:
             raise InputError(f"{where}: {name} has more than {MOST_STARS} stars; write names out.")
     for name, known in _AXES.items():
-        if content.get(name, known[0]) not in known:
-            raise InputError(
-                f"{where}: {name} is {content[name]!r}; it must be {' or '.join(known)}."
-            )
+        refuse_others(f"{where}: {name}", [content.get(name, known[0])], known)
     conditions = content.get("where", {})
     if not isinstance(conditions, dict):
         raise InputError(f"{where}: where is no {{FIELD: VALUE}}; see docs/recordings.md.")
@@ -380,9 +372,8 @@ def _condition(path: str, value: Any) -> Condition:
 
 def as_text(value: Any) -> str:
     """Return a value of a field as text: 1 for 1.0 and for true."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
+    number = number_of(value)
+    if math.isnan(number):
         return str(value).strip()
     return str(int(number)) if number.is_integer() else repr(number)
 

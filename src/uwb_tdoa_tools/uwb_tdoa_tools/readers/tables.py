@@ -32,6 +32,7 @@ from uwb_tdoa_bias.common.errors import (
     Budget,
     InputError,
     most_unpacked,
+    number_of,
 )
 from uwb_tdoa_bias.common.files import read_bytes, read_head
 
@@ -332,10 +333,7 @@ def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
 
 def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
     """Return a cell as a float. Raise InputError unless it is finite."""
-    try:
-        value = float(row[column])
-    except ValueError:
-        value = math.nan
+    value = number_of(row[column])
     if not math.isfinite(value):
         raise InputError(
             f"{path}: line {line}: {column} is {row[column][:40]!r}; it must be a finite number."

@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.arrays import numbers_of
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 from uwb_tdoa_bias.common.safe_yaml import read_yaml
 from uwb_tdoa_bias.common.sensors import SENSORS
 
@@ -570,10 +571,7 @@ class SimulationConfig(_Noises):
             ("yaw", YAW_PROFILES),
             ("protocol", PROTOCOLS),
         ):
-            if getattr(self, name) not in choices:
-                raise InputError(
-                    f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}."
-                )
+            refuse_others(name, [getattr(self, name)], choices)
         for name in ("seed", "tag_unit"):
             value = getattr(self, name)
             if not (isinstance(value, (int, np.integer)) and 0 <= value < 2**32):
@@ -717,8 +715,5 @@ class SimulationConfig(_Noises):
 
 def _are_points(points: Any, lengths: tuple[int, ...]) -> bool:
     """Return whether these are points with equally many finite coordinates."""
-    try:
-        array = np.array(points, dtype=float)
-    except (TypeError, ValueError):
-        return False
+    array = numbers_of(points)
     return array.ndim == 2 and array.shape[1] in lengths and bool((np.abs(array) < FARTHEST).all())

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EFFECTS, Effect, SmoothTerm
 
@@ -34,8 +34,7 @@ def parse_effect(name: str, values: Sequence[str]) -> Effect:
 
     Raises InputError.
     """
-    if name not in EFFECTS:
-        raise InputError(f"--effect: {name!r} is not known; choose {', '.join(EFFECTS)}.")
+    refuse_others("--effect", [name], EFFECTS)
     kind = EFFECTS[name]
     parameters: dict[str, Any] = {}  # the Effect converts the texts
     for text in ",".join(values).split(","):

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 
 from .config import REST_HEIGHT, Complete, Room
 
@@ -157,10 +157,7 @@ def path_of(s: np.ndarray, config: Complete, room: Room, rng: np.random.Generato
 
     Raises InputError if they leave the room.
     """
-    if config.trajectory not in TRAJECTORIES:
-        raise InputError(
-            f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}."
-        )
+    refuse_others("trajectory", [config.trajectory], TRAJECTORIES)
     family, name = TRAJECTORIES[config.trajectory], config.trajectory
     if config.path is not None or config.poses is not None:
         family, name = waypoints if config.poses is None else timed, "the path"

@@ -26,7 +26,7 @@ from scipy.spatial.distance import cdist
 from sklearn.neural_network import MLPRegressor
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError, refuse_others
 from uwb_tdoa_bias.common.files import temporary_folder, write_bytes, write_picture
 from uwb_tdoa_bias.common.flight import SENSOR_NAMES, Flight, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
@@ -622,8 +622,7 @@ def train(
         If the kind is unknown or a flight cannot be used.
     """
     kind, seed = recipe
-    if kind not in MODELS:
-        raise InputError(f"model: {kind!r} is not known; choose {', '.join(MODELS)}.")
+    refuse_others("model", [kind], MODELS)
     first, second = ([labels(flight) for flight in group] for group in (training, validation))
     meta: dict[str, Any] = {
         "name": name,
