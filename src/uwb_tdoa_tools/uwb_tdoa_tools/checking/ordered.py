@@ -91,7 +91,7 @@ class SurveyFit:
         """
         self.positions = positions
         # columns of each window, and (6,) m and m/s of the tag at its end
-        self._windows, self._start, self._errors = [], [], np.zeros((len(positions), FUNCTIONS))
+        self._windows, self._start = [], []
         config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
         workspace.set_bounds(state.record.extent, config.workspace_margin, box)  # writes box
         rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
@@ -161,7 +161,7 @@ class SurveyFit:
         half = len(self) // 2
         parts = [self._part(slice(None, half)), self._part(slice(half, None))]
         gains = [
-            test.before - test._at(fitted.solve(functions=functions)[1])
+            test.before - test.solve([], functions, fitted.solve(functions=functions)[1])[0]
             for fitted, test in (parts, parts[::-1])
         ]
         return float(np.mean(gains))
@@ -189,17 +189,11 @@ class SurveyFit:
         part.before, _ = part.solve([])
         return part
 
-    def _at(self, fitted: np.ndarray) -> float:
-        """Return the loss with the anchors at positions (N, 3) m, or with errors (N, FUNCTIONS)."""
-        other = copy(self)
-        if fitted.shape[1] == 3:
-            other.positions = fitted
-        else:
-            other._errors = fitted
-        return other.solve([])[0]
-
     def solve(
-        self, free: Sequence[int] | None = None, functions: int = 0
+        self,
+        free: Sequence[int] | None = None,
+        functions: int = 0,
+        given: np.ndarray | None = None,
     ) -> tuple[float, np.ndarray]:
         """Move the tag, and the anchors in `free`, to the least loss.
 
@@ -214,6 +208,8 @@ class SurveyFit:
         functions : int
             If not 0, leave the anchors where they are, and fit errors of their signals: the first of
             the FUNCTIONS of the place.
+        given : array or None
+            Where to begin, as `anchors` below; None for the anchors as surveyed, without errors.
 
         Returns
         -------
@@ -226,7 +222,9 @@ class SurveyFit:
         moved = np.ones(count, dtype=bool) if free is None else np.isin(range(count), free)
         size, std = (functions, RADIO) if functions else (3, PRIOR)
         columns = np.flatnonzero(np.repeat(moved, size))  # free unknowns
-        unknown, start = np.zeros((count, size)), [x.copy() for x in self._start]
+        surveyed = 0.0 if functions else self.positions
+        unknown = np.zeros((count, size)) if given is None else given - surveyed
+        start = [x.copy() for x in self._start]
         # In a hall each window has few of the anchors.
         heard = [moved & np.isin(np.arange(count), ends[1:3]) for ends in self._windows]
         # columns of their unknowns
@@ -236,7 +234,8 @@ class SurveyFit:
             g = -unknown.reshape(-1)[columns] / std**2
             eliminated = []
             for x, window, some, own in zip(start, self._windows, heard, heard_columns):
-                by_tag, by_anchors, residual = self._linearised(x, window, unknown, some)
+                residual, by_tag, ends = self._linearised(x, window, unknown)
+                by_anchors = _by_anchors(window, ends, some)
                 weight = (
                     min(1.0, TOGETHER / len(residual))
                     / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
@@ -256,12 +255,12 @@ class SurveyFit:
             unknown.reshape(-1)[columns] += step
             for x, solved, own in zip(start, eliminated, heard_columns):
                 x += np.clip(solved[:, -1] - solved[:, :-1] @ step[own], -2.0, 2.0)
-        return self._loss(start, unknown), unknown if functions else self.positions + unknown
+        return self._loss(start, unknown), surveyed + unknown
 
     def _loss(self, states: list[np.ndarray], unknown: np.ndarray) -> float:
         """Return the mean Geman-McClure loss over the windows."""
         squares = (
-            self._residual(x, window, unknown)[0] ** 2 for x, window in zip(states, self._windows)
+            self._linearised(x, window, unknown)[0] ** 2 for x, window in zip(states, self._windows)
         )
         return (
             float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares]))
@@ -269,49 +268,39 @@ class SurveyFit:
             else np.nan
         )
 
-    def _place(self, x: np.ndarray) -> np.ndarray:
-        """Return the FUNCTIONS of the place of which errors of the radio consist, (4,)."""
-        return np.append(1.0, (x[:3] - self.positions.mean(axis=0)) / NEAR)
-
-    def _residual(
+    def _linearised(
         self, x: np.ndarray, window: Window, unknown: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
+    ) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Return residuals (n,) m, their Jacobian (n, 6) by position and velocity of the tag, and more.
 
-        The times are relative to the end of the window. `unknown` is as of `solve`, (N, 3) by which
-        the anchors are moved, or (N, 1) or (N, 4).
+        That is the Jacobians by the unknowns of the anchors a and b, (n, size) each. `unknown` is as in
+        `solve`: (N, 3) by which the anchors are moved, or (N, 1) or (N, 4) errors of their signals.
         """
         t, a, b, d = window
-        size = unknown.shape[1]
-        anchors = self.positions + unknown if size == 3 else self.positions
-        place = self._place(x)
-        late = self._errors @ place + (0.0 if size == 3 else unknown @ place[:size])
+        place = np.append(1.0, (x[:3] - self.positions.mean(axis=0)) / NEAR)[: unknown.shape[1]]
+        moved = unknown.shape[1] == 3
+        anchors = self.positions + unknown if moved else self.positions
+        late = np.zeros(len(anchors)) if moved else unknown @ place
         before = t - t[-1]
         tag = x[:3] + before[:, None] * x[3:]
         from_a, from_b = tag - anchors[a], tag - anchors[b]
         ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
         residual = d - (rb + late[b] - ra - late[a])
-        return residual, from_a / ra[:, None], from_b / rb[:, None], before
+        by_a, by_b = from_a / ra[:, None], -from_b / rb[:, None]
+        by_tag = np.column_stack([-by_b - by_a, before[:, None] * (-by_b - by_a)])
+        if not moved:
+            by_a, by_b = np.tile(-place, (len(d), 1)), np.tile(place, (len(d), 1))
+        return residual, by_tag, (by_a, by_b)
 
-    def _linearised(
-        self, x: np.ndarray, window: Window, unknown: np.ndarray, moved: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the Jacobians of the TDOAs and the residuals (n,).
 
-        The first Jacobian (n, 6) is by position and velocity of the tag. The second (n, k size) is by
-        the unknowns of the k anchors in `moved` (N,).
-        """
-        residual, from_a, from_b, before = self._residual(x, window, unknown)
-        by_position, size = from_b - from_a, unknown.shape[1]
-        by_tag = np.column_stack([by_position, before[:, None] * by_position])
-        if size != 3:
-            from_b = np.tile(-self._place(x)[:size], (len(residual), 1))
-            from_a = from_b
-        by_anchors, number = np.zeros((len(residual), int(moved.sum()), size)), np.cumsum(moved) - 1
-        for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
-            rows = np.flatnonzero(moved[ends])
-            by_anchors[rows, number[ends[rows]]] += by_end[rows]
-        return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
+def _by_anchors(window: Window, by_ends: Sequence[np.ndarray], moved: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (n, k size) by the k anchors in `moved` (N,), of those by both ends."""
+    out = np.zeros((len(window[0]), int(moved.sum()), by_ends[0].shape[1]))
+    number = np.cumsum(moved) - 1
+    for ends, by_end in zip(window[1:3], by_ends):
+        rows = np.flatnonzero(moved[ends])
+        out[rows, number[ends[rows]]] += by_end[rows]
+    return np.asfortranarray(out.reshape(len(out), -1))
 
 
 def differences(ranges: Ranges, anchors: Anchors) -> Tdoas:
