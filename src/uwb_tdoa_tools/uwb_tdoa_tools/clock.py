@@ -425,20 +425,23 @@ def in_words(jump: Jump) -> tuple[str, str]:
         f"{jump.after:.1f} s after the first"
     )
     shifted = f"the stamps after it are shifted by {-jump.by:+.3f} s"
-    if jump.kind == WRAP:
-        return f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}", shifted
-    if jump.kind == RESTART:
-        restart = ", and the filter starts anew there" if jump.leads else ""
-        return (
+    anew = ", and the filter starts anew there" * jump.leads
+    return {
+        WRAP: (
+            f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}",
+            shifted,
+        ),
+        RESTART: (
             f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}",
-            shifted + restart,
-        )
-    if jump.kind == SET:
-        return f"the clock of {who} was set forward {where}, by {_long(jump.by)}", shifted
-    return (
-        f"the recorder paused, or the clock of {who} was set forward, by {_long(jump.by)} {where}",
-        "no stamp is changed",
-    )
+            shifted + anew,
+        ),
+        SET: (f"the clock of {who} was set forward {where}, by {_long(jump.by)}", shifted),
+        SILENCE: (
+            f"the recorder paused, or the clock of {who} was set forward, by {_long(jump.by)} "
+            f"{where}",
+            "no stamp is changed",
+        ),
+    }[jump.kind]
 
 
 def _long(seconds: float) -> str:
