@@ -51,6 +51,12 @@ def test_what_recurs_goes_on_beyond_its_domain_and_fades(shape, knots):
     np.testing.assert_allclose(seen.corrected_bias(samples), weight * one.bias(samples), atol=1e-12)
 
 
+@pytest.mark.parametrize("knots", [[[0.0, 1.0], [2.0, 3.0]], "12", 1.0, [0.0, "b"], None])
+def test_knots_are_a_list_of_numbers(knots):
+    with pytest.raises(InputError, match="two or more"):
+        SmoothTerm({"c1": 0.3}, covariate="time", knots=knots, shape="spline", form="common")
+
+
 def test_a_spline_is_constant_beyond_its_knots():
     at = np.array([-5.0, 1.0, 9.0, 50.0])
     np.testing.assert_allclose(term().curve(at), [0.1, 0.1, 0.3, 0.3], atol=1e-12)

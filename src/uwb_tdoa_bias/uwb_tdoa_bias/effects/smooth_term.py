@@ -470,7 +470,8 @@ def _check(setting: str, value: str, known: Collection[str]) -> None:
 
 def _rising(setting: str, knots: Any, shape: str) -> tuple[float, ...]:
     """Return the knots of a shape as a tuple; raise InputError if they are none."""
-    out = tuple(np.atleast_1d(numbers_of(knots)).tolist())
+    found = numbers_of(knots)
+    out = tuple(found.tolist()) if found.ndim == 1 else ()
     count = SHAPES[shape][0] if shape in SHAPES else None
     if len(out) != (count or max(len(out), 2)) or not (np.diff(out) > 0.0).all():
         expected = count or "two or more"
