@@ -99,7 +99,7 @@ class ScriptedSearch:
     def without(self, names):
         return ScriptedSearch(self.left_out | names)
 
-    def found(self, start=None):
+    def found(self, start=None, own=()):
         assert (start is None) == (not self.left_out), "a repeated search goes on from the last"
         frame = Candidate((Term(EFFECTS["truth_frame"](), ()),))
         chosen = (frame,) * ("truth_frame" not in self.left_out)
@@ -130,8 +130,9 @@ def test_the_search_is_repeated_without_what_misleads_the_filter(errors, without
         worst = next(one for one in ("anchor_delay", "nlos", "") if one not in found.left_out)
         refused = (Refused(worst, "misleads"), Refused("other", str(error)))
         misleading = frozenset((worst,)) - {""}
+        selection = SimpleNamespace(own=())
         return ValidatedSelection(
-            None, (), refused, {}, error, misleading=misleading, poses="of the run before"
+            selection, (), refused, {}, error, misleading=misleading, poses="of the run before"
         )
 
     monkeypatch.setattr(module, "EffectSearch", lambda *_, **__: ScriptedSearch())

@@ -212,6 +212,23 @@ def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
     assert np.abs(spoilt.only([delay]).fit.beta - half.beta).max() > 1e-4
 
 
+def test_what_is_set_apart_stays_in_the_fit_of_the_others(late):
+    """Without the delay in the fit, positions stand in for it."""
+    table, candidates = late
+    delay, position = named(candidates, "anchor_delay"), named(candidates, "anchor_position")
+    selection = select(table, [delay], fit(table, columns_of(candidates)).inflation).plus(position)
+    apart = selection.apart([delay])
+    assert (apart.chosen, apart.own) == ((position,), (delay,))
+    assert len(apart.loss) == len(apart.rivals) == 1
+    alone, beside = (
+        one.kept([position]).fit.values(position.columns) for one in (selection, apart)
+    )
+    both = refit(table, columns_of([delay, position]), selection.fit).values(position.columns)
+    np.testing.assert_allclose(beside, both, atol=1e-9)
+    assert np.linalg.norm(beside) < 0.8 * np.linalg.norm(alone)
+    assert [effect.name for effect in effects_of(apart.kept([position]))] == ["anchor_position"]
+
+
 def test_applied_positions_have_a_tight_prior_and_all_other_values_the_usual_one(late):
     table, candidates = late
     delay, position = named(candidates, "anchor_delay"), named(candidates, "anchor_position")

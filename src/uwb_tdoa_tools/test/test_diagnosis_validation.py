@@ -447,6 +447,9 @@ class Worth:
     def __init__(self, worth):
         self.worth = worth
 
+    def set_apart(self, candidates):
+        assert not candidates
+
     def start(self, candidates, detections):
         lost = sum(by for name, by in self.worth.items() if name not in candidates)
         return 1.0 + lost + 0.5 * (not {"a", "b"} & set(candidates))
@@ -473,6 +476,7 @@ def selected(monkeypatch, worth, shares=((1.0, 1.0),), flights=2, detections=())
     selection = SimpleNamespace(
         chosen=tuple(map(Some, worth)), kept=lambda candidates, share=None: tuple(candidates)
     )
+    trials.selection = selection
     attribution = SimpleNamespace(selection=selection, detections=detections, names=("f", "g"))
     return select_by_error(attribution, [None] * flights, Baseline(NONE))
 
@@ -534,7 +538,10 @@ def test_effects_beside_an_event_of_one_flight_are_judged_again_without_it(monke
     monkeypatch.setattr(
         validation, "_why_of_this_flight", lambda _, one: reason if one == "c" else None
     )
+    apart = []
+    monkeypatch.setattr(Worth, "set_apart", lambda _, candidates: apart.extend(candidates))
     found = selected(monkeypatch, {"c": 0.0, "d": 0.0}, flights=1)
+    assert apart == ["c"]
     assert found.selection == () and found.error == pytest.approx(1.4)
     assert found.worth == {"c": pytest.approx(0.6), "d": pytest.approx(-0.2)}
     event, harmful = found.refused

@@ -258,11 +258,14 @@ class EffectSearch:
         fewer._detectors = [one for one in self._detectors if one.effect.name not in names]
         return fewer
 
-    def found(self, start: Attribution | None = None) -> Attribution:
+    def found(
+        self, start: Attribution | None = None, own: Collection[Candidate] = ()
+    ) -> Attribution:
         """Return the Attribution with what it needs to validate effects.
 
         start : Attribution of an earlier search. The search goes on from those of its effects that
             this search may find. By default it begins with none.
+        own : its Candidates of these flights alone, from which the search goes on in any case
         """
         refused: list[Refused] = []
         if start is None:
@@ -271,7 +274,7 @@ class EffectSearch:
                 selection = self._validated(self._with_functions(selection), refused)
         else:
             refused += start.refused
-            selection = self._validated(self._resumed(start.selection), refused)
+            selection = self._validated(self._resumed(start.selection, own), refused)
         if self._undeclared and len(self.names) >= FOR_MAPS:
             selection = with_maps(selection, self._smooth)
         labels = {one.label for one in selection.chosen}
@@ -363,12 +366,12 @@ class EffectSearch:
         )
         return relinearised(selection, self.residuals, self.declared + self._smooth)
 
-    def _resumed(self, start: Selection) -> Selection:
+    def _resumed(self, start: Selection, own: Collection[Candidate]) -> Selection:
         """Return the Selection after one more search, from those effects that it may find.
 
-        start : Selection of an earlier search for more effects
+        start : Selection of an earlier search for more effects; own : as of `found`
         """
-        kept = [one for one in start.chosen if one.name not in self._left_out]
+        kept = [one for one in start.chosen if one in own or one.name not in self._left_out]
         scan = self._scan_of(start.table) if self._undeclared else None
         everything, inflation = [*self._smooth, *self.declared], start.fit.inflation
         selection = select(

@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector, FixedPoses
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.sensor import shifted
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -95,7 +95,7 @@ class Baseline:
         missing = [flight for flight in flights if id(flight) not in self._runs]
         missing = list({id(flight): flight for flight in missing}.values())
         cases = [ValidationCase(flight, self.base) for flight in missing]
-        for run, flight in zip(map_function(partial(_run, self.config), cases), missing):
+        for run, flight in zip(map_function(partial(run_of, self.config), cases), missing):
             self._runs[id(flight)] = flight, run  # the flight is kept, because its id is the key
             progress()
 
@@ -133,7 +133,7 @@ def with_config(
 
     before : side of `compare` that the gain is counted from; shift_std, map_function : as there
     """
-    after = _side(zip(cases, map_function(partial(_run, config), cases)))
+    after = _side(zip(cases, map_function(partial(run_of, config), cases)))
     after["pooled"].update(_intervals(before, after, shift_std))
     return after
 
@@ -245,15 +245,27 @@ def _both_sides(
     yield ((replace(case, effects=baseline.base), baseline.run(case.flight)) for case in cases)
 
     def after() -> Iterator[tuple[ValidationCase, Run]]:
-        for case, run in zip(cases, map_function(partial(_run, baseline.config), cases)):
+        for case, run in zip(cases, map_function(partial(run_of, baseline.config), cases)):
             yield case, run
             progress()
 
     yield after()
 
 
-def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
-    return run_offline(case.flight, config, Corrector(case.flight.anchors, case.effects))
+def run_of(
+    config: FilterConfig | None, case: ValidationCase, poses: FixedPoses | None = None
+) -> Run:
+    """Return the Run of a ValidationCase.
+
+    poses : poses for the corrections; None corrects at the poses of the run, as nodes do
+    """
+    anchors, effects = case.flight.anchors, case.effects
+    corrector = (
+        Corrector(anchors, effects)
+        if poses is None
+        else FixedPoseCorrector(anchors, effects, poses)
+    )
+    return run_offline(case.flight, config, corrector)
 
 
 def _spread(run: Run) -> float | None:

@@ -298,12 +298,14 @@ def _searched(
     while True:
         for names in _suspects(found, selected):
             fewer = search.without(names)
-            other = fewer.found(found)
+            other = fewer.found(found, selected.selection.own)
             trial = judged(other, selected.poses)
             if gain(selected.error, trial.error) > LOSS:
                 break
         else:
-            return search.reported(found), replace(selected, refused=(*refused, *selected.refused))
+            # A search keeps what belongs to these flights alone, and refuses it once more.
+            together = dict.fromkeys((*refused, *selected.refused))
+            return search.reported(found), replace(selected, refused=tuple(together))
         # The repeated search does not report these effects.
         known = [one for one in selected.refused if one.what in names]
         better = validation.why_without(selected.error, trial.error)

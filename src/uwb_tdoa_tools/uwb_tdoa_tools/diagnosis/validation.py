@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import chain, cycle
@@ -13,16 +13,16 @@ from typing import TypeVar
 import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector, FixedPoses
+from uwb_tdoa_bias.correction.corrector import FixedPoses
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.offline import Run, run_offline
+from uwb_tdoa_ekf.offline import Run
 from uwb_tdoa_ekf.results import poses_of
 
 from ..parallel import MapFunction
 from ..scoring.metrics import EVERYTHING, LOSS, Score, gain, rms
 from .attribution import Attribution
-from .comparison import Baseline, ValidationCase, score
+from .comparison import Baseline, ValidationCase, run_of, score
 from .detectors import Detection
 from .deviations import with_deviations
 from .findings import Refused, usable
@@ -31,7 +31,7 @@ from .refinement import effects_of, recurs
 from .regression.fit import refit
 from .regression.select import Selection
 from .regression.table import BLOCK
-from .regression.terms import Candidate, columns_of
+from .regression.terms import Candidate
 
 Made = TypeVar("Made")
 
@@ -130,7 +130,7 @@ def cross_fitted(
             for k in range(2)
         ]
         parts = [(half, 0, number % 2 != k) for k, half in enumerate(halves)]
-    out, columns = [], columns_of(candidates)
+    out, columns = [], selection.columns(candidates)
     for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(
             selection,
@@ -164,9 +164,9 @@ def select_by_error(
     then predict the error without several of them, and candidates are dropped one by one by this
     prediction. The filter runs again with the rest, until no candidate is dropped. Detections stay
     only if the error falls with them. Beside them the candidates must still gain LOSS together. At
-    most TRIAL_FLIGHTS flights are judged. Of two flights none may get worse by an effect. Events at
-    a time are tried for their worth, but not kept: another flight does not have them at the same
-    time.
+    most TRIAL_FLIGHTS flights are judged. Of two flights none may get worse by an effect. Events of
+    these flights alone are tried for their worth, but not kept: another flight does not have them.
+    They stay in the fit, because other effects would stand in for them.
 
     map_function : as of `attribute`
     poses : of an earlier ValidatedSelection of these flights, for the first corrections
@@ -188,12 +188,9 @@ def select_by_error(
             whole = displacements.error([])
             for one in applicable:
                 worth[one] = displacements.error([one]) - whole
-            if alone:
-                unsure = _of_this_flight(attribution.selection, applicable)
-            elif momentary := {one: OF_A_TIME for one in applicable if _momentary(one)}:
-                unsure = momentary
-            else:
-                unsure = _harmful(attribution, candidates, applicable)
+            unsure = own = _own(trials.selection, applicable, alone)
+            if not own and not alone:
+                unsure = _harmful(trials.selection, attribution.names, candidates, applicable)
                 if len(flights) == 2:
                     unsure = unsure or _worse_in_one(displacements, applicable)
             if not unsure:
@@ -201,6 +198,7 @@ def select_by_error(
             # The others were judged beside these, and are judged again without them.
             refused += [Refused(one.label, why) for one, why in unsure.items()]
             candidates = [one for one in candidates if one not in unsure]
+            trials.set_apart(own)
             error = trials.start(candidates, detections)
             continue
         kept = [one for one in candidates if one not in gone]
@@ -243,7 +241,7 @@ def select_by_error(
     remains = min(error / without, 1.0) if candidates else 0.0
     share = 1.0 - UNEXPLAINED * remains**2 / len(flights)
     # with the weights of the trials
-    selection = attribution.selection.kept(candidates, share)
+    selection = trials.selection.kept(candidates, share)
     return ValidatedSelection(
         selection,
         tuple(detections),
@@ -257,14 +255,19 @@ def select_by_error(
 
 
 def _harmful(
-    attribution: Attribution, candidates: Sequence[Candidate], applicable: Sequence[Candidate]
+    selection: Selection,
+    names: Sequence[str],
+    candidates: Sequence[Candidate],
+    applicable: Sequence[Candidate],
 ) -> dict[Candidate, str]:
     """Return the Candidate that most likely does harm to another flight, and why; {} without one.
 
     Flights show different shares of it, beside the other candidates.
+
+    names : of the flights
     """
-    selection = attribution.selection.kept(candidates)
-    several = {one: shares(selection, one, attribution.names) for one in applicable}
+    selection = selection.kept(candidates)
+    several = {one: shares(selection, one, names) for one in applicable}
     probability = {one: harm(of_flights) for one, of_flights in several.items()}
     worst = max(probability, key=probability.__getitem__)
     if probability[worst] <= MOST_HARM:
@@ -363,8 +366,15 @@ def _momentary(candidate: Candidate) -> bool:
     )
 
 
-def _of_this_flight(selection: Selection, candidates: Sequence[Candidate]) -> dict[Candidate, str]:
-    """Return the Candidates that belong to a single flight alone, and why."""
+def _own(
+    selection: Selection, candidates: Sequence[Candidate], alone: bool
+) -> dict[Candidate, str]:
+    """Return the Candidates that belong to these flights alone, and why.
+
+    alone : whether there is a single flight
+    """
+    if not alone:
+        return {one: OF_A_TIME for one in candidates if _momentary(one)}
     reasons = {one: _why_of_this_flight(selection, one) for one in candidates}
     return {
         one: f"{reason}, and another one may not have it: {SECOND}"
@@ -425,6 +435,16 @@ class _Trials:
         self.poses = [FixedPoses(poses_of(run.odometry)) for run, _ in judged]
         return float(np.mean([of_case.rmse_3d for of_case in self._now]))
 
+    @property
+    def selection(self) -> Selection:
+        """Return the Selection that is tried."""
+        return self._attribution.selection
+
+    def set_apart(self, candidates: Collection[Candidate]) -> None:
+        """Keep Candidates in the fits, and do not correct them: other flights do not have them."""
+        apart = self.selection.apart(candidates)
+        self._attribution = replace(self._attribution, selection=apart)
+
     def error(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """Return the error of a model, m."""
         tried = self._tried(_scored, self._cases(candidates, detections))
@@ -459,7 +479,7 @@ class _Trials:
         selection = self._attribution.selection
         others = [other for other in candidates if other is not one]
         whole, rest = (
-            refit(selection.table, columns_of(several), selection.fit)
+            refit(selection.table, selection.columns(several), selection.fit)
             for several in (candidates, others)
         )
         information = selection.fit.information(selection.table)
@@ -505,18 +525,9 @@ def _scored(config: FilterConfig | None, trial: tuple[ValidationCase, FixedPoses
 def _judged(
     config: FilterConfig | None, trial: tuple[ValidationCase, FixedPoses | None]
 ) -> tuple[Run, Score]:
-    """Return the Run and the Score of a trial.
-
-    trial : ValidationCase, and the poses for corrections, None to use the poses of the run
-    """
+    """Return the Run and the Score of a trial: a ValidationCase, and poses as of `run_of`."""
     case, poses = trial
-    anchors, effects = case.flight.anchors, case.effects
-    corrector = (
-        Corrector(anchors, effects)
-        if poses is None
-        else FixedPoseCorrector(anchors, effects, poses)
-    )
-    run = run_offline(case.flight, config, corrector)
+    run = run_of(config, case, poses)
     return run, score(case, run)
 
 

@@ -23,7 +23,7 @@ from .fit import Fit, fit, refit
 from .scan import Scan
 from .scorer import Scorer
 from .table import RegressionTable
-from .terms import Candidate, columns_of
+from .terms import Candidate, Column, columns_of
 
 MAX_STEPS = 14  # largest number of forward steps
 FITTED = 9  # proposals of a scan that separate fits score
@@ -63,6 +63,7 @@ class Selection:
     table : RegressionTable with the columns of all candidates; fit : Fit of the chosen ones
     loss : decrease of the criterion without each chosen Candidate
     rivals : (Rival, ...) of each chosen Candidate, filled by `with_rivals`
+    own : Candidates of these flights alone, in the Fit too; others would stand in for them
     """
 
     table: RegressionTable
@@ -70,13 +71,22 @@ class Selection:
     fit: Fit
     loss: tuple[float, ...]
     rivals: tuple[tuple[Rival, ...], ...]
+    own: tuple[Candidate, ...] = ()
+
+    def columns(self, candidates: Iterable[Candidate]) -> list[Column]:
+        """Return the Columns of a fit of Candidates: theirs, and those of `own`."""
+        return columns_of([*candidates, *self.own])
+
+    def apart(self, candidates: Collection[Candidate]) -> Selection:
+        """Return the Selection with some of the chosen Candidates among `own`."""
+        rest = [one for one in self.chosen if one not in candidates]
+        return replace(self, **self._chosen_of(rest), own=(*self.own, *candidates))
 
     def only(self, candidates: Collection[Candidate]) -> Selection:
         """Return the Selection of some of the chosen Candidates, with a new robust fit."""
         chosen = self._chosen_of(candidates)
-        return replace(
-            self, **chosen, fit=fit(self.table, columns_of(chosen["chosen"]), self.fit.inflation)
-        )
+        columns = self.columns(chosen["chosen"])
+        return replace(self, **chosen, fit=fit(self.table, columns, self.fit.inflation))
 
     def kept(self, candidates: Collection[Candidate], share: float | None = None) -> Selection:
         """Return the Selection of some of the chosen Candidates, with the present weights.
@@ -86,7 +96,7 @@ class Selection:
         share : as of `refit`
         """
         chosen = self._chosen_of(candidates)
-        columns = columns_of(chosen["chosen"])
+        columns = self.columns(chosen["chosen"])
         return replace(self, **chosen, fit=refit(self.table, columns, self.fit, share=share))
 
     def where(self, keeps: Callable[[Effect], bool]) -> Selection:
@@ -102,7 +112,7 @@ class Selection:
         )
         chosen = tuple(part for part in parts if part is not None)
         return replace(
-            self, **{**of, "chosen": chosen}, fit=refit(self.table, columns_of(chosen), self.fit)
+            self, **{**of, "chosen": chosen}, fit=refit(self.table, self.columns(chosen), self.fit)
         )
 
     def _chosen_of(self, candidates: Collection[Candidate]) -> dict[str, Any]:
@@ -115,7 +125,7 @@ class Selection:
     def plus(self, candidate: Candidate) -> Selection:
         """Return the Selection with one more Candidate; the table has its columns."""
         chosen = (*self.chosen, candidate)
-        model = fit(self.table, columns_of(chosen), self.fit.inflation)
+        model = fit(self.table, self.columns(chosen), self.fit.inflation)
         return replace(
             self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ())
         )
