@@ -14,7 +14,7 @@ READ = set(  # options and arguments that name inputs, or no path
     """flights flight input bag map anchors areas survey effects config model peer marks distances holdout odometry beside antenna
     walls places poses coordinates static data columns seed names firmware build""".split()
 )
-NUMBERS = "int", "float", "whole_number"  # names of option types
+NUMBERS = "int", "float", "positive", "whole_number"  # names of option types
 PATHS = re.compile("FILE|DIR|BAG|LOG|CSV|MAP|FLIGHT|IN$|S$|ANCHORS|LIBRARY|DATA|DIRECTORY|FOLDER")
 
 
