@@ -439,9 +439,9 @@ class Estimator:
         self._pipeline.change_anchors(self._anchor_table.change(anchors))
 
     def recalibrated(self) -> None:
-        """Search for changes anew: from now on TDOAs are corrected by another calibration.
+        """Begin the search for changes again, because another calibration corrects the TDOAs now.
 
-        It contains the changes that were found before.
+        The calibration contains the changes that were found before.
         """
         if self._pipeline.monitor is not None:
             self._pipeline.monitor.restart()

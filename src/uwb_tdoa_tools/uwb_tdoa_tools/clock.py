@@ -425,7 +425,7 @@ def in_words(jump: Jump) -> tuple[str, str]:
         f"{jump.after:.1f} s after the first"
     )
     shifted = f"the stamps after it are shifted by {-jump.by:+.3f} s"
-    anew = ", and the filter starts anew there" * jump.leads
+    anew = ", and the filter starts anew there" if jump.leads else ""
     return {
         WRAP: (
             f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}",

@@ -29,7 +29,7 @@ class Stamped:
 
 
 def numbers_of(values: Any) -> np.ndarray:
-    """Return a list of numbers, or of lists of them, as an array; one NaN, (1,), if it is none."""
+    """Return values as an array of floats; [NaN] if they are no numbers."""
     try:
         return np.array(values, dtype=float)
     except (TypeError, ValueError, OverflowError):

@@ -120,15 +120,23 @@ def wrong_values(path: KnownPath) -> Iterator[Finding]:
                 found.setdefault(rule.__name__[1:], {})[pair] = fault
                 break
     for name, of_pairs in found.items():
-        of_all = len(of_pairs) >= MOST * len(path.pairs)
-        count = f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: "
-        for (a, b), (what, evidence, remedy, value) in [*of_pairs.items()][: 1 if of_all else None]:
-            who = "TDOAs of all pairs are wrong: each" if of_all else f"TDOA of the pair ({a}, {b})"
+        if len(of_pairs) >= MOST * len(path.pairs):
+            _, (what, evidence, remedy, value) = next(iter(of_pairs.items()))
             yield Finding(
-                f"{'tdoa' if of_all else 'pair'}_{name}",
+                f"tdoa_{name}",
                 ERROR,
-                cause=f"the {who} {what}",
-                evidence=count * of_all + evidence,
+                cause=f"the TDOAs of all pairs are wrong: each {what}",
+                evidence=f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: {evidence}",
+                remedy=remedy,
+                value=value,
+            )
+            continue
+        for pair, (what, evidence, remedy, value) in of_pairs.items():
+            yield Finding(
+                f"pair_{name}",
+                ERROR,
+                cause=f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}",
+                evidence=evidence,
                 remedy=remedy,
                 value=value,
             )

@@ -41,7 +41,7 @@ class Step:
 
     name : of the piece; first, last : s, its stamps
     before, after : m, slow innovations with the calibration in use, and with the candidate that was found
-        before this piece; NaN if there is none
+        before this piece; NaN if there is none of use
     taken : whether the candidate is used from now on; text : what happened, as a sentence
     """
 
@@ -97,14 +97,14 @@ class StreamCalibration:
         refusals: list[str] = []
         text, after, taken = "nothing to judge yet", np.nan, False
         for candidate in self._candidates:
+            why_not = _refusal(candidate)
             try:
                 effects = with_calibration(
                     self.effects, candidate.found(candidate.shifts), candidate.covariance
                 )
-                after = self._slow(piece, effects)
-                why_not = candidate.why_not or self._reason_against(changed, before, after)
-                if len({change.anchor for change in _changes(candidate)}) > MOST_CHANGED:
-                    why_not = f"more than {MOST_CHANGED} anchors have changed: survey them again"
+                if why_not is None:
+                    after = self._slow(piece, effects)
+                    why_not = self._reason_against(changed, before, after)
             except InputError as error:  # these anchors give no estimate
                 why_not = str(error)
             if why_not is not None:
@@ -169,6 +169,13 @@ class StreamCalibration:
         if changed and after > SMALLEST_RATIO * self._level:
             return f"{fall}: not back to {100 * self._level:.1f} cm"
         return fall if after > before else None
+
+
+def _refusal(found: SelfCalibration) -> str | None:
+    """Return why a calibration is of no use on any data, or None."""
+    if len({change.anchor for change in _changes(found)}) > MOST_CHANGED:
+        return f"more than {MOST_CHANGED} anchors have changed: survey them again"
+    return found.why_not
 
 
 def _changes(found: SelfCalibration) -> Sequence[AnchorChange]:
