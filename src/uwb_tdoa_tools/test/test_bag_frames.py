@@ -23,7 +23,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import new_bag, open_bag
-from uwb_tdoa_tools.bags.messages import STREAMS, header_of, pose_of, transforms_message, typestore
+from uwb_tdoa_tools.bags.messages import STREAMS, anchor_transforms, header_of, pose_of, typestore
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.check import processed_streams
 from uwb_tdoa_tools.checking.recording import read_recording
@@ -263,7 +263,7 @@ def test_frames_of_tf_static_are_anchors(tmp_path):
     write_topics(
         tmp_path / "bag",
         tdoas(),
-        ("/tf_static", TRANSFORMS, [transforms_message(ANCHORS, 5, typestore())]),
+        ("/tf_static", TRANSFORMS, [anchor_transforms(ANCHORS, 5, typestore())]),
     )
     back = read_bag(tmp_path / "bag")
     np.testing.assert_array_equal(back.anchors.ids, ANCHORS.ids)

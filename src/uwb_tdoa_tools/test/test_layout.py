@@ -56,7 +56,6 @@ KEYS = {
     "onnxruntime": ("python3-onnxruntime-pip", "onnxruntime"),
     "pymavlink": (None, "pymavlink"),  # for protocol mavlink
     "pytest": ("python3-pytest", "pytest"),
-    "rerun": (None, "rerun-sdk"),  # for --rerun
     "rosbags": ("python3-rosbags-pip", "rosbags"),
     "pandas": (None, "pandas"),  # optional, for tables
     "scipy": ("python3-scipy", "scipy"),

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.memory import REJECTED, USED
@@ -123,6 +124,17 @@ def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
     recorded = read_odometry(tmp_path / "flight_bag")
     np.testing.assert_allclose(recorded.p, odometry.p, atol=1e-12)
     np.testing.assert_allclose(recorded.v, odometry.v, atol=1e-9)
+    with AnyReader([tmp_path / "flight_bag"]) as reader:
+        moves = [
+            reader.deserialize(data, one.msgtype)
+            for one, _, data in reader.messages(
+                [one for one in reader.connections if one.topic == "/tf"]
+            )
+        ]
+    frames = [move.transforms[0] for move in moves]
+    assert {(one.header.frame_id, one.child_frame_id) for one in frames} == {("map", "base_link")}
+    moved = [one.transform.translation for one in frames]
+    np.testing.assert_allclose([(p.x, p.y, p.z) for p in moved], odometry.p, atol=1e-12)
     np.testing.assert_allclose(
         recorded.covariance[:, :3, :3], odometry.covariance[:, :3, :3], atol=1e-12
     )

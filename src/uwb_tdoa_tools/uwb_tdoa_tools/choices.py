@@ -30,9 +30,6 @@ PROFILE = (
     "how to read recordings of others: a profile that is shipped "
     "(convert --suggest names it), or your own YAML file (docs/recordings.md)"
 )
-RERUN = (
-    "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
-)
 COLUMNS = (
     "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, "
     "tdoa; or anchor, range; "

@@ -26,7 +26,6 @@ from .choices import ALIGN, FRAME, NONE, TIME
 from .cli import file_name
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
-from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, Recording, report_remarks
 from .scoring.evaluation import (
     Alignment,
@@ -83,7 +82,6 @@ class Evaluator:
     odometry : bag whose odometry is scored instead, or None.
     picture : image file of the errors, or None.
     trajectories : folder for TUM files, or None.
-    rerun : file for Rerun, or None.
     align : one of ALIGN, alignment of the ground truth before scoring.
     """
 
@@ -92,7 +90,6 @@ class Evaluator:
     odometry: str | None = None
     picture: str | None = None
     trajectories: Path | None = None
-    rerun: Path | None = None
     align: str = NONE
 
     def __call__(self, recording: Recording) -> Result:
@@ -144,9 +141,6 @@ class Evaluator:
             folder, name = self.trajectories, file_name(flight.name)
             write_tum(folder / f"{name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{name}_truth.tum", truth.t, truth.p, truth.q)
-        if self.rerun:
-            lines = [f"{name}: {value}" for name, value in score.row().items()]
-            write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
         aligned = {
             **alignment.as_dict(),
             "align": self.align,

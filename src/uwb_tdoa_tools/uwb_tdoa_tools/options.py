@@ -18,12 +18,12 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import choices
 from .choices import ALIGN, NONE, STORAGES
-from .cli import Option, OutputFile, OutputFolder, exclusive, option
+from .cli import Option, OutputFolder, exclusive, option
 from .parallel import whole_number
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
@@ -117,7 +117,6 @@ TAPE = (  # how well anchors are known
 )
 # fields of Tape, which the covariance of the last calibration replaces
 OF_TAPE = "std", "height_std", "trusted", "trusted_std"
-RERUN = option("--rerun", metavar="FILE", type=OutputFile, help=choices.RERUN)
 DISTANCES = option(
     "--distances",
     metavar="FILE",
@@ -330,20 +329,6 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
         **{name: getattr(args, name) for name in OF_TAPE if given(args, name)},
         unknown=tuple(args.unknown),
     )
-
-
-def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
-    """Return the path of --rerun; None without it, or without the library. Raises InputError.
-
-    count : number of flights, which must be one; say(sentence) reports a missing library.
-    """
-    from .localizing import pictures
-
-    if not args.rerun:
-        return None
-    if count != 1:
-        raise InputError(f"--rerun: needs exactly one flight, got {count}.")
-    return args.rerun if pictures.rerun_is_installed(say) else None
 
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:

@@ -150,7 +150,7 @@ def write_odometry(
 ) -> dict[str, int]:
     """Write an Odometry among Anchors as a bag, see `write_bag`.
 
-    Its topics are odometry, uwb/anchors and /tf_static.
+    Its topics are odometry, /tf, uwb/anchors and /tf_static.
     """
     store = typestore()
     if not len(odometry):
@@ -161,6 +161,8 @@ def write_odometry(
     kind, content = "nav_msgs/msg/Odometry", bag_messages.odometry_content(odometry)
     made = bag_messages.messages_of("odometry", kind, odometry.t, content, anchors.frame, store)
     topics["/odometry"] = kind, STREAM_QOS, made
+    poses = bag_messages.tag_transforms(odometry, anchors.frame, store)
+    topics["/tf"] = TRANSFORMS, STREAM_QOS, poses
     with new_bag(out, "mcap", force) as writer:
         return _write(writer, topics, store)
 
@@ -174,10 +176,10 @@ def _of_anchors(
     """
     # at equal stamps the order of the topics holds: anchors first
     array = bag_messages.anchors_message(anchors, first, store)
-    frames = bag_messages.transforms_message(anchors, first, store, antenna)
+    frames = bag_messages.anchor_transforms(anchors, first, store, antenna)
     return {
         "/uwb/anchors": ("uwb_tdoa_msgs/msg/AnchorArray", LATCHED_QOS, [array]),
-        "/tf_static": ("tf2_msgs/msg/TFMessage", LATCHED_QOS, [frames]),
+        TF_STATIC: (TRANSFORMS, LATCHED_QOS, [frames]),
     }
 
 

@@ -351,7 +351,7 @@ def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int
     )
 
 
-def transforms_message(
+def anchor_transforms(
     anchors: Anchors, stamp: int, store: Typestore, antenna: Sequence[float] | None = None
 ) -> tuple[int, Any]:
     """Return (stamp ns, tf2_msgs/TFMessage) with frames anchor_<id> and the antenna.
@@ -359,7 +359,6 @@ def transforms_message(
     The antenna is at (3,) m in the body frame. An unknown orientation becomes the identity, because
     tf cannot express it.
     """
-    types = store.types
     q_or_identity = np.where(
         np.isfinite(anchors.orientations), anchors.orientations, [0.0, 0.0, 0.0, 1.0]
     )
@@ -371,6 +370,22 @@ def transforms_message(
     ]
     if antenna:
         frames.append((BODY_FRAME, ANTENNA_FRAME, antenna, (0.0, 0.0, 0.0, 1.0)))
+    return _transforms(stamp, frames, store)
+
+
+def tag_transforms(odometry: Odometry, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
+    """Yield (stamp ns, tf2_msgs/TFMessage) with the pose of the body in a frame."""
+    for stamp, p, q in zip(nanoseconds("odometry", odometry.t), odometry.p, odometry.q):
+        yield _transforms(int(stamp), [(frame, BODY_FRAME, p.tolist(), q.tolist())], store)
+
+
+def _transforms(
+    stamp: int,
+    frames: Sequence[tuple[str, str, Sequence[float], Sequence[float]]],
+    store: Typestore,
+) -> tuple[int, Any]:
+    """Return (stamp ns, tf2_msgs/TFMessage) of frames: (parent, child, position m, quaternion x y z w)."""
+    types = store.types
     transforms = [
         types["geometry_msgs/msg/TransformStamped"](
             header_of(store, stamp, parent),

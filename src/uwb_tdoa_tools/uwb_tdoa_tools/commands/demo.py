@@ -38,7 +38,6 @@ def parser() -> ArgumentParser:
         "demo",
         "demo --seed 7 --json demo.json",
         "demo --flight 0607/tdoa2-obs-log1 --survey anchor_0607.txt --rate 4",
-        "demo --flight flight_bag --rerun out/flight.rrd",
         "demo --flight flight_bag --effects effects.yaml --out out/corrected",
         options=[
             option(
@@ -71,7 +70,6 @@ def parser() -> ArgumentParser:
             ),
             option("--effects", metavar="FILE", help="effects.yaml to correct with"),
             options.MODEL,
-            options.RERUN,
             option(
                 "--json",
                 metavar="FILE",
@@ -91,7 +89,6 @@ def _demo(args: Namespace) -> int:
         options.refuse(args, ("seed", "json"), "belongs to the simulated hall")
     else:
         options.refuse(args, ("effects", "model"), "needs --flight: the demo writes its own")
-    args.rerun = options.rerun_of(args, 1, partial(cli.say, "demo"))
     args.out.mkdir(parents=True, exist_ok=True)
     return _measured(args) if args.flight else _loop(args)
 
@@ -103,8 +100,6 @@ def _loop(args: Namespace) -> int:
     result, figures = demo.close_loop(
         args.seed or SEED, args.out, args.rate, _show, partial(cli.say, "demo")
     )
-    if args.rerun is not None and not result.missing:
-        result.show(args.rerun)
     cli.write_json(args.json, figures)
     _show("next", demo.next_steps(args.out / "flight-3_bag"), keep=True)
     return int(result.failed)
@@ -142,7 +137,6 @@ def _measured(args: Namespace) -> int:
         files,
         args.out,
         args.rate,
-        args.rerun,
         lambda text: cli.show(f"nodes      {text}"),
     )
     _show("nodes", demo.arrivals_in_words(flight, live.outcome))
@@ -153,8 +147,6 @@ def _measured(args: Namespace) -> int:
     residuals = [residuals_of(flight, by) for by in (None, correction)[: len(scores) - 1]]
     demo.draw(args.out / "error.png", flight, residuals, scores[:-1])
     cli.show(f"plot       {args.out / 'error.png'}")
-    if args.rerun is not None:
-        cli.show(f"rerun      {args.rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     _show("next", demo.next_steps(args.flight, args.survey), keep=True)
     return int(scores[-2].row()["diverged"])  # of the nodes

@@ -47,7 +47,6 @@ def parser() -> ArgumentParser:
             "diagnosis/"
         ),
         "diagnose flight_bag --effects effects.yaml --out second/",
-        "diagnose flight_bag --rerun flight.rrd --out diagnosis/",
         "diagnose flight_bag --reference heights --out by-height/",
         (
             "diagnose flight_bag --reference odometry --odometry /vio/odometry --marks marks.yaml "
@@ -128,7 +127,6 @@ def parser() -> ArgumentParser:
             ),
             options.most(MOST),
             options.align(),
-            options.RERUN,
             options.JOBS,
             options.out(),
         ],
@@ -144,7 +142,6 @@ def _diagnose(args: Namespace) -> int:
     from ..diagnosis.next_flight import plan_flight
     from ..diagnosis.noise import has_imu, write_parameters
     from ..estimate import FlightEstimator
-    from ..localizing.pictures import write_diagnosis
     from ..readers import inputs
     from ..simulation.config import Room
     from ..surveying.report import read_paths
@@ -161,7 +158,6 @@ def _diagnose(args: Namespace) -> int:
     ):
         return 1
     found = reading.find(args.flights)
-    rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
     jobs, dask, over = parallel.workers_for(args, len(found))
     flights, holdout = (
         reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
@@ -237,8 +233,6 @@ def _diagnose(args: Namespace) -> int:
     }
     for name, text in more_files.items():
         write_text(out / name, text)
-    if rerun is not None:
-        write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))
     files = (
         *("diagnosis.json", "effects.yaml"),

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
-from functools import partial
 
 from uwb_tdoa_bias.common.errors import InputError
 
@@ -63,7 +62,6 @@ def parser() -> ArgumentParser:
                 type=OutputFolder,
                 help="write estimates and truths as TUM trajectories, e.g. for evo",
             ),
-            options.RERUN,
             options.JOBS,
         ],
     )
@@ -89,10 +87,7 @@ def _evaluate(args: Namespace) -> int:
         if getattr(args, name) and len(found) != 1:
             raise InputError(f"--{name}: needs exactly one flight, got {len(found)}.")
     trajectories = args.tum.absolute() if args.tum else None
-    rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
-    evaluator = Evaluator(
-        reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align
-    )
+    evaluator = Evaluator(reading, estimator, args.odometry, args.plot, trajectories, args.align)
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(evaluating.head_line())

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from functools import partial
 
 from .. import cli, options, parallel
 from ..cli import OutputFile, option, positive
@@ -36,7 +35,6 @@ def parser() -> ArgumentParser:
             "--config calibrated/ekf_node.yaml --out out/"
         ),
         "localize flight_bag --bag --json located.json --out out/",
-        "localize flight_bag --rerun flight.rrd --out out/",
         "localize hall_bag --zones 20 --out out/",
         "localize tag1_bag tag2_bag --areas areas.yaml --out out/",
         options=[
@@ -59,7 +57,6 @@ def parser() -> ArgumentParser:
                 metavar="FILE",
                 help="YAML file of named areas, name: [[x, y], ...] in m: write when the tag enters and leaves",
             ),
-            options.RERUN,
             option("--json", metavar="FILE", type=OutputFile, help="write all figures"),
             options.JOBS,
             options.out(),
@@ -73,17 +70,15 @@ def _localize(args: Namespace) -> int:
 
     out = args.out
     named = areas.read_areas(args.areas) if args.areas else {}
-    say = partial(cli.say, "localize")
     estimator = options.estimator_of(args)
     reading = options.reading_of(args, truth=False)
     found = reading.find(args.flights, bool(args.dask))
     check_names(found)
-    rerun = options.rerun_of(args, len(found), say)
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
     folder, located = out.absolute() if args.dask else out, []
     localizer = Localizer(
-        reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects, named
+        reading, estimator, folder, args.bag, args.residuals, args.zones, args.effects, named
     )
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)

@@ -32,7 +32,6 @@ from ..cli import Progress, as_json
 from ..diagnosis import diagnose
 from ..diagnosis.report.entries import entries, worth_in_words
 from ..diagnosis.result import Diagnosis
-from ..localizing.pictures import write_rerun
 from ..readers.inputs import Reading
 from ..scoring.metrics import Estimate, Score, change_in_words, position_at
 from ..scoring.pairs import CM, PairResiduals, residuals_of
@@ -294,7 +293,6 @@ def fly(
     files: Mapping[str, str | Path | None],
     folder: Path,
     rate: float,
-    rerun: Path | None = None,
     say: Callable[[str], object] = print,
 ) -> tuple[LivePass, list[Score]]:
     """Play a flight to both nodes, and run the filter without ROS.
@@ -310,8 +308,6 @@ def fly(
         For the bag and the output of the nodes.
     rate : float
         Speed of the replay.
-    rerun : Path, optional
-        Write the output of the nodes for Rerun.
     say : callable
         Called with lines of progress.
 
@@ -332,27 +328,15 @@ def fly(
     live = through_nodes(flight, bag, folder, rate, files, say)
     if live.missing:
         return live, []
-    raw = run_offline(flight)
-    estimates: dict[str, Estimate] = {"nodes": live.odometry, "without ROS": raw.odometry}
-    offline = raw
+    raw = run_offline(flight).odometry
+    estimates: dict[str, Estimate] = {"nodes": live.odometry, "without ROS": raw}
     if correction is not None:
-        offline = run_offline(flight, corrector=correction)
         estimates = {
-            "raw": raw.odometry,
+            "raw": raw,
             "corrected": live.odometry,
-            "corrected, without ROS": offline.odometry,
+            "corrected, without ROS": run_offline(flight, corrector=correction).odometry,
         }
     scores = [Score(name, one, flight.known_truth) for name, one in estimates.items()]
-    if rerun is not None:
-        write_rerun(
-            rerun,
-            flight,
-            live.odometry,
-            offline.residuals,
-            [change_of_scores(scores)],  # of the first two
-            flight.known_truth,
-            None if correction is None else raw.odometry,
-        )
     return live, scores
 
 
@@ -435,14 +419,6 @@ class LoopResult:
                 "seconds": laps,
                 "processor_time": processor_time(),
             }
-        )
-
-    def show(self, path: Path) -> None:
-        """Write a file for Rerun."""
-        before, *more = (one.odometry for one in self.passes)
-        estimate, raw = (more[0], before) if more else (before, None)
-        write_rerun(
-            path, self.flight, estimate, None, [self.error_in_words()], self.flight.truth, raw
         )
 
 

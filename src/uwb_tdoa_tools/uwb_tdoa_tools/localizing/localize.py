@@ -342,7 +342,6 @@ class Localizer:
     estimator : filter with corrections.
     folder : output folder.
     bag, residuals : also write a bag, residuals.
-    rerun : file for Rerun, or None.
     zones : m, size of squares for a table of heard anchors, or None.
     effects : file with the effects of the estimator, or None.
     areas : named polygons, whose visits are written.
@@ -353,7 +352,6 @@ class Localizer:
     folder: Path
     bag: bool = False
     residuals: bool = False
-    rerun: Path | None = None
     zones: float | None = None
     effects: str | None = None
     areas: areas.Areas = field(default_factory=dict)
@@ -389,9 +387,6 @@ class Localizer:
                 self.zones,
                 f"{name}: squares of {self.zones:g} m",
             )
-        if self.rerun is not None:
-            pictures.write_rerun(self.rerun, flight, odometry, left, assessment.sentences())
-            written.append(self.rerun)
         track = areas.track_of(odometry)
         stays = (*areas.visits(track, self.areas), *areas.parked(track))
         if stays:

@@ -1,38 +1,28 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""An estimate drawn: as a picture, and for the viewer Rerun (rerun.io)."""
+"""Draw an estimate, its residuals, and where anchors are heard."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_picture, write_text
-from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_ekf.core.memory import USED
 from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals
 
-from ..estimate import FlightEstimator
-from ..scoring.metrics import has_innovation, position_at, within
+from ..scoring.metrics import has_innovation, within
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-    from types import ModuleType
+    from collections.abc import Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_ekf.core.config import FilterConfig
-
-    from ..bags.bag import RecordedOdometry
-    from ..diagnosis.result import Diagnosis
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
 SHOWN = 20  # largest number of pairs in the picture: those with the most TDOAs
@@ -273,14 +263,6 @@ def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, tit
 ELLIPSES = 60  # along the path
 SIGMAS = 3.0
 MARGIN = 0.5  # m around anchors and path
-RERUN_RATE = 20.0  # Hz, of poses that are written
-BLUE, RED, GREY, BLACK, ORANGE = (
-    (31, 119, 180),
-    (214, 39, 40),
-    (120, 120, 120),
-    (40, 40, 40),
-    (255, 127, 14),
-)
 
 
 def estimate_figure(
@@ -390,129 +372,3 @@ def _plane(
         ax.legend(
             handles=marks, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, fontsize=8
         )
-
-
-def rerun_is_installed(say: Callable[[str], object]) -> bool:
-    """Return whether the library is installed; if not, call say(sentence)."""
-    if find_spec("rerun") is not None:
-        return True
-    say(
-        "--rerun is left out: the viewer's library is not installed; pip install rerun-sdk "
-        "(it needs numpy 2)."
-    )
-    return False
-
-
-def write_rerun(
-    path: Path,
-    flight: Flight,
-    odometry: Odometry | RecordedOdometry,
-    residuals: Residuals | None,
-    verdict: Sequence[str],
-    truth: Truth | None = None,
-    before: Odometry | RecordedOdometry | None = None,
-) -> None:
-    """Write a .rrd file for the viewer Rerun. Time is s since the first TDOA.
-
-    Parameters
-    ----------
-    odometry : estimate among the anchors of the Flight.
-    residuals : shown per pair, or None.
-    verdict : sentences.
-    truth : ground truth, if it is to be shown.
-    before : estimate before a correction, or None.
-    """
-    import rerun
-
-    begin = flight.start
-    stream = rerun.RecordingStream("uwb_tdoa")
-    stream.save(path)
-    anchors = flight.anchors
-    labels = [str(number) for number in anchors.ids.tolist()]
-    stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log(
-        "world/anchors",
-        rerun.Points3D(anchors.positions, labels=labels, radii=0.06, colors=BLACK),
-        static=True,
-    )
-    for name, path_of, colour in (
-        ("path", odometry, BLUE),
-        ("truth", truth, GREY),
-        ("before", before, ORANGE),
-    ):
-        if path_of is not None:
-            line = rerun.LineStrips3D([path_of.p], colors=colour, radii=0.005)
-            stream.log(f"world/{name}", line, static=True)
-    stream.log(
-        "verdict", rerun.TextDocument("\n\n".join(verdict), media_type="text/markdown"), static=True
-    )
-    _write_poses(rerun, stream, odometry, begin)
-    std = np.sqrt(np.einsum("nii->ni", odometry.covariance[:, :3, :3]))
-    for k, axis in enumerate("xyz"):
-        _write_scalars(rerun, stream, f"deviation/{axis}", odometry.t - begin, std[:, k])
-    for one in by_pair(residuals) if residuals is not None else ():
-        _write_scalars(rerun, stream, f"residual/{one.a}-{one.b}", one.t - begin, one.value)
-    if truth is not None:
-        for name, estimate in (("error", odometry), ("error/before", before)):
-            if estimate is not None:
-                error = np.linalg.norm(estimate.p - position_at(estimate.t, truth), axis=1)
-                _write_scalars(rerun, stream, name, estimate.t - begin, error)
-    stream.flush()
-    stream.disconnect()
-
-
-def write_diagnosis(
-    path: Path, result: Diagnosis, base: EffectSet, config: FilterConfig | None
-) -> None:
-    """Write the single flight of a Diagnosis: estimates with `base` and with the found effects."""
-    from ..diagnosis.output import as_text  # takes a second to import
-
-    (flight,) = result.flights
-    before, after = (FlightEstimator(config, effects)(flight) for effects in (base, result.effects))
-    truth = flight.truth if result.reference.tells_errors else None
-    write_rerun(
-        path,
-        flight,
-        after.odometry,
-        after.residuals,
-        as_text(result).splitlines(),
-        truth,
-        before.odometry,
-    )
-
-
-def _write_poses(
-    rerun: ModuleType, stream: Any, odometry: Odometry | RecordedOdometry, begin: float
-) -> None:
-    """Write the tag and its ellipsoid of three standard deviations, at most RERUN_RATE times per second."""
-    cells = np.floor((odometry.t - begin) * RERUN_RATE) if len(odometry.t) else np.zeros(0)
-    rows = np.flatnonzero(np.diff(cells, prepend=-np.inf) > 0.0)
-    values, vectors = np.linalg.eigh(odometry.covariance[rows, :3, :3])
-    vectors *= np.sign(np.linalg.det(vectors))[:, None, None]  # right-handed
-    turned = Rotation.from_matrix(vectors).as_quat() if len(rows) else np.zeros((0, 4))
-    half = SIGMAS * np.sqrt(np.maximum(values, 0.0))
-    for row, size, q in zip(rows.tolist(), half, turned):
-        stream.set_time("time", duration=float(odometry.t[row] - begin))
-        stream.log("world/tag", rerun.Points3D([odometry.p[row]], radii=0.04, colors=RED))
-        stream.log(
-            "world/tag/3_sigma",
-            rerun.Ellipsoids3D(
-                centers=[odometry.p[row]],
-                half_sizes=[size],
-                quaternions=[rerun.Quaternion(xyzw=q)],
-                colors=RED,
-            ),
-        )
-    stream.reset_time()
-
-
-def _write_scalars(
-    rerun: ModuleType, stream: Any, name: str, t: np.ndarray, values: np.ndarray
-) -> None:
-    """Write a curve over time, s."""
-    known = np.isfinite(values)
-    stream.send_columns(
-        name,
-        indexes=[rerun.TimeColumn("time", duration=t[known])],
-        columns=rerun.Scalars.columns(scalars=values[known]),
-    )
