@@ -105,6 +105,29 @@ def slow_innovations(
     )
 
 
+def path_by_anchors(
+    flight: Flight, effects: EffectSet, config: FilterConfig | None = None
+) -> list[np.ndarray]:
+    """Return derivatives of the position in each BLOCK by anchors, [(3, 4N)].
+
+    They are by all coordinates, anchor by anchor, then by all delays. An error of the position is taken as
+    constant in a block, and as the one that fits its TDOAs and ranges best. Ground truth is not used.
+    """
+    runs, anchors = Runs([flight], effects, config), flight.anchors
+    _, parts = _residuals(
+        effects, runs._of_innovations, anchors, np.zeros(len(anchors)), runs.flights[0], None
+    )
+    out = []
+    for part in parts:
+        samples = part.samples
+        by_place, by_anchor = samples.position_jacobian(), _regressors(samples, functions=False)
+        block = np.floor((samples.t - samples.t[0]) / BLOCK)
+        for number in np.unique(block):
+            rows = block == number
+            out.append((by_anchor[rows].T @ np.linalg.pinv(by_place[rows]).T).T)
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Equations:
     """Normal equations of one flight, or of all flights.
