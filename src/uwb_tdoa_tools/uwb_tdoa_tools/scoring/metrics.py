@@ -225,23 +225,32 @@ def pooled_errors(runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     runs : figures of each run, see `ErrorSeries.figures`.
     """
     of_runs = {
-        name: np.array([figures[name] for figures in runs])
-        for name in (*WHOLE, *ROOTS, "nees_mean", "max_3d", "step")
+        name: np.array([figures[name] for figures in runs if figures["count"]])
+        for name in ("rmse_3d", "nees_mean", "max_3d", "step")
     }
-    count = of_runs["count"]
-    total = count.sum()
-    out: dict[str, Any] = {"runs": len(count)}
-    out |= {name: of_runs[name].sum().item() for name in WHOLE}
-    some = {name: values[count > 0] for name, values in of_runs.items()}
-    shares = some["count"] / max(total, 1)
-    for name in ROOTS:
-        out[name] = math.sqrt(shares @ some[name] ** 2) if total else math.nan
-    out["nees_mean"] = float(shares @ some["nees_mean"]) if total else math.nan
+    out: dict[str, Any] = {"runs": len(runs)}
+    out |= {name: sum(figures[name] for figures in runs) for name in WHOLE}
+    out |= _of_all_samples(runs, (*ROOTS, "nees_mean"))
     for name in ("max_3d", "step"):
-        out[name] = or_nan(np.max, some[name])
+        out[name] = or_nan(np.max, of_runs[name])
     for name in ("rmse_3d", "nees_mean"):
-        out[f"{name}_median_of_runs"] = or_nan(np.median, some[name])
-        out[f"{name}_max_of_runs"] = or_nan(np.max, some[name])
+        out[f"{name}_median_of_runs"] = or_nan(np.median, of_runs[name])
+        out[f"{name}_max_of_runs"] = or_nan(np.max, of_runs[name])
+    return out
+
+
+def _of_all_samples(runs: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, float]:
+    """Return {name: mean of the samples of all runs}, NaN without any; of ROOTS the root mean square.
+
+    runs : figures of each run, and the "count" of its samples.
+    """
+    some, out = [figures for figures in runs if figures["count"]], {}
+    count = [figures["count"] for figures in some]
+    for name in names:
+        power = 2 if name in ROOTS else 1
+        values = np.array([figures[name] for figures in some]) ** power
+        mean = float(np.average(values, weights=count)) if some else math.nan
+        out[name] = mean ** (1 / power)
     return out
 
 
@@ -252,14 +261,12 @@ class Result:
     Attributes
     ----------
     row : figures, see `Score.row`.
-    sums : {name: sum over the samples}.
     distributions : {quantity: Distribution}.
     phases : figures of each phase, see `Score.phases`.
     aligned : `Alignment.as_dict` and the 3D RMSE, m, with each of ALIGN; empty if not computed.
     """
 
     row: dict[str, Any]
-    sums: dict[str, float]
     distributions: dict[str, Distribution]
     phases: dict[str, dict[str, Any]]
     aligned: dict[str, Any] = field(default_factory=dict)
@@ -273,21 +280,14 @@ class Pool:
     """Pool the samples of several runs, one run after the other."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, list[float]] = defaultdict(list)  # figures of the runs
-        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
+        self._rows: list[dict[str, Any]] = []  # figures of the runs, with "count", of their errors
         self._distributions = {name: Distribution.of([]) for name in ("distance", "nees", "nis")}
         self._phases: dict[str, list[dict[str, Any]]] = defaultdict(list)  # figures of the runs
         self._aligned: dict[str, Any] = Counter()
-        self.attitudes: dict[str, tuple[float, ...]] = {}  # {flight: ATTITUDE} where it is known
 
     def add(self, result: Result) -> None:
         """Count the Result of one run."""
-        for name in ("rmse_3d", "start_delay", "ready_delay", "diverged", "late_start"):
-            self._rows[name].append(result.row[name])
-        attitude = tuple(result.row[name] for name in ATTITUDE)
-        if not math.isnan(attitude[2]):
-            self.attitudes[result.row["flight"]] = attitude
-        self._sums.update(result.sums)
+        self._rows.append({**result.row, "count": result.distributions["distance"].count})
         for name, part in result.distributions.items():
             self._distributions[name] += part
         for name, figures in result.phases.items():
@@ -297,9 +297,18 @@ class Pool:
             self._aligned[how] += math.nan if error is None else error
 
     @property
+    def attitudes(self) -> dict[str, tuple[float, ...]]:
+        """Return {flight: ATTITUDE} of the runs in which it is known."""
+        return {
+            row["flight"]: tuple(row[name] for name in ATTITUDE)
+            for row in self._rows
+            if not math.isnan(row["median_yaw"])
+        }
+
+    @property
     def aligned(self) -> dict[str, float]:
         """Return {one of ALIGN: mean 3D RMSE of the runs, m}; NaN for a truth on another clock."""
-        return {how: total / len(self._rows["rmse_3d"]) for how, total in self._aligned.items()}
+        return {how: total / len(self._rows) for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
         """Return {name: figures, see `pooled_errors`} of the phases that any run has."""
@@ -311,22 +320,21 @@ class Pool:
         They are those of `summary`, the coverage, mean and maximum of the 3D RMSE over runs, and
         the phases. Medians of samples are accurate to 1 %.
         """
-        distance, errors = self._distributions["distance"], self._rows["rmse_3d"]
-        count = distance.count
-        shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
+        distance, errors = self._distributions["distance"], [row["rmse_3d"] for row in self._rows]
         out: dict[str, Any] = {"flight": f"{len(errors)} pooled"}
-        out |= {
-            f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")
-        }
-        out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
-        out["frac_gt_1m"] = shares["lost"] if count else 1.0
+        out |= _of_all_samples(
+            self._rows, ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "frac_gt_1m", *COVERAGE)
+        )
+        out["median_3d"] = distance.median
+        out["max_3d"] = distance.largest if distance.count else math.nan
+        out["frac_gt_1m"] = out["frac_gt_1m"] if distance.count else 1.0
         for name in ("nees", "nis"):
             part = self._distributions[name]
             out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= {name: shares.get(name, math.nan) for name in COVERAGE}
-        out["start_delay"] = max(self._rows["start_delay"])
-        out["ready_delay"] = float(np.fmax.reduce(self._rows["ready_delay"]))  # NaN if unknown
-        out |= {name: sum(self._rows[name]) for name in ("diverged", "late_start")}
+        out["start_delay"] = max(row["start_delay"] for row in self._rows)
+        ready = [row["ready_delay"] for row in self._rows]
+        out["ready_delay"] = float(np.fmax.reduce(ready))  # NaN if unknown
+        out |= {name: sum(row[name] for row in self._rows) for name in ("diverged", "late_start")}
         out["rmse_3d_mean_of_runs"] = sum(errors) / len(errors)
         out["rmse_3d_max_of_runs"] = float(np.max(errors))
         return {**out, "phases": self.phases()}
@@ -692,18 +700,10 @@ class Score:
 
     def result(self) -> Result:
         """Return the Result of this run, from which `Pool` makes the figures of many runs."""
-        distance, count = np.linalg.norm(self.error, axis=1), len(self.t)
-        sums = {
-            f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")
-        }
-        sums["square_3d"] = float(np.sum(distance**2))
-        sums["lost"] = float(np.sum(~(distance <= LOST)))
-        if count:
-            shares = coverage(self.error, self.covariance)
-            sums |= {name: count * share for name, share in shares.items()}
+        distance = np.linalg.norm(self.error, axis=1)
         samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
         of_samples = {name: Distribution.of(values) for name, values in samples.items()}
-        return Result(self.row(), sums, of_samples, self.phases())
+        return Result(self.row(), of_samples, self.phases())
 
 
 def pooled(scores: Iterable[Score]) -> dict[str, Any]:
