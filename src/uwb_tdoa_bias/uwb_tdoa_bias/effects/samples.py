@@ -273,17 +273,14 @@ def _repeated(value: Any, times: int) -> Any:
 
 
 @dataclass(frozen=True)
-class ImuSamples(Stamped):
-    """Means of an inertial sensor over n short cells.
+class AxesSamples(Stamped):
+    """A batch of n measurements of a sensor of the vehicle, with k axes.
 
-    channel : "gyro" or "accel"
+    channel : name of the stream, or of one of its parts
     t : (n,) s; p : (n, 3) m, world; start : s, as of Samples
-    reading : (n, 3) value that effects are functions of, body: the measured rate, which is less
-        noisy than the true one, or a force whose noise the residual does not share
-    time_derivative : (n, 3) derivative of the reading by time, per s, or None
-    up : (n, 3) vertical of the world, body
-    features : (n, len(OF_IMU)) covariates; motion : Motion
-    extra : {name: (n,)}, further columns of a recording, or None
+    reading : (n, k) value that effects are functions of
+    time_derivative : (n, k) derivative of the reading by time, per s, or None
+    up : the vertical of the world, body; motion : Motion
     """
 
     channel: str
@@ -293,32 +290,35 @@ class ImuSamples(Stamped):
     reading: np.ndarray
     time_derivative: np.ndarray | None
     up: np.ndarray
-    features: np.ndarray
     motion: Motion
+
+
+@dataclass(frozen=True)
+class ImuSamples(AxesSamples):
+    """Means of an inertial sensor over n short cells; its channel is "gyro" or "accel".
+
+    reading : (n, 3), body: the measured rate, which is less noisy than the true one, or a force
+        whose noise the residual does not share
+    up : (n, 3)
+    features : (n, len(OF_IMU)) covariates
+    extra : {name: (n,)}, further columns of a recording, or None
+    """
+
+    features: np.ndarray
     extra: dict[str, np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
-class SensorSamples(Stamped):
+class SensorSamples(AxesSamples):
     """A batch of n measurements of an auxiliary sensor.
 
-    channel : name of the stream, or of one of its parts
-    t : (n,) s; p : (n, 3) m, world; start : s, as of Samples
     reading : (n, k) true value: range to the ground at z = 0, m; height for a barometer, m;
         velocity, m/s, body; yaw rate, rad/s, body
-    time_derivative : (n, k) derivative of the reading by time, per s
     up : (n,) cosine of the tilt, NaN if the attitude is unknown
-    motion : Motion; vibration : (n,) as of Samples, or None
+    vibration : (n,) as of Samples, or None
     """
 
-    channel: str
-    t: np.ndarray
-    p: np.ndarray
-    start: float
-    reading: np.ndarray
     time_derivative: np.ndarray
-    up: np.ndarray
-    motion: Motion
     vibration: np.ndarray | None = None
 
 
@@ -582,7 +582,7 @@ def shown_in(covariate: str, unknown: str = "") -> tuple[str, float]:
     return ("degrees", DEGREES) if unit == "rad" else (unit, 1.0)
 
 
-def sensor_covariate(name: str, samples: ImuSamples | SensorSamples) -> np.ndarray | None:
+def sensor_covariate(name: str, samples: AxesSamples) -> np.ndarray | None:
     """Return a covariate of ImuSamples or SensorSamples, (n,); None if the samples lack it.
 
     name : of OF_SENSORS; for ImuSamples also of OF_IMU, or "extra.NAME"

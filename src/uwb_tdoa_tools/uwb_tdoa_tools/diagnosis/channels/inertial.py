@@ -71,8 +71,8 @@ class Inertial(AxesChannel):
             reading,
             time_derivative,
             up,
-            features,
             track.motion(t),
+            features,
             extra_at(comparison.flight, t),
         )
 
