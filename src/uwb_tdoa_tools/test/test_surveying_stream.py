@@ -65,7 +65,7 @@ def test_pieces_are_the_flight_without_truth(flights):
 def test_a_piece_is_used_once_the_next_one_agrees(calibrated, flights):
     calibration, steps = calibrated
     assert not steps[0].taken and np.isnan(steps[0].after)
-    assert steps[1].taken and steps[1].after < steps[1].before / stream.SMALLEST_RATIO
+    assert steps[1].taken and steps[1].after < 0.5 * steps[1].before
     assert calibration.number == sum(step.taken for step in steps)
     other = flights[2]
     assert rmse(other, calibration.effects) < 0.5 * rmse(other, EffectSet())
@@ -149,8 +149,8 @@ def test_what_makes_the_next_piece_worse_is_not_taken(flights, monkeypatch):
     first, second = in_pieces(flights[0])
     wrong = []
 
-    def instead(*given):
-        found = real(*given)
+    def instead(*given, **more):
+        found = real(*given, **more)
         wrong.append(found.surveyed.at(found.given.positions - 2.0 * found.shifts))
         return replace(found, surveyed=wrong[-1])
 
@@ -161,6 +161,50 @@ def test_what_makes_the_next_piece_worse_is_not_taken(flights, monkeypatch):
     step = calibration.take(second)
     assert wrong and not step.taken and "not taken: slow innovations" in step.text
     assert calibration.number == 0 and len(calibration.effects) == 0
+
+
+def test_a_tape_that_is_better_than_the_pieces_tell_is_kept():
+    clean = [clean_flight(seed, 2.0 * PIECE) for seed in SEEDS[:2]]
+    given = clean[0].anchors
+    off = np.random.default_rng(7).normal(0.0, 0.1 * TAPE, given.positions.shape)
+    calibration = StreamCalibration(given.at(given.positions + off), Tape(TAPE))
+    steps = taken_all(calibration, [replace(one, anchors=calibration.given) for one in clean])
+    assert not any(step.taken for step in steps)
+    assert any("is expected to leave" in step.text for step in steps)
+
+
+def test_a_first_calibration_that_tells_too_little_is_continued(flights, monkeypatch):
+    priors = []
+
+    def instead(given, tape, base, config):
+        priors.append(base.covariance)
+        return real(given, tape, base, config)
+
+    real = stream.self_calibrate
+    monkeypatch.setattr(stream, "self_calibrate", instead)
+    monkeypatch.setattr(stream, "LARGEST_SHARE", 0.0)
+    calibration = StreamCalibration(flights[0].anchors, Tape(TAPE))
+    steps = taken_all(calibration, flights[:2])
+    assert not any(step.taken for step in steps) and not len(calibration.effects)
+    assert priors[0] is None
+    sizes = [np.trace(one.matrix) for one in priors[1:]]
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < sizes[0]
+    monkeypatch.undo()
+    piece = next(in_pieces(flights[2]))
+    assert calibration.take(piece).taken  # it holds all pieces
+    assert rmse(flights[2], calibration.effects) < 0.5 * rmse(flights[2], EffectSet())
+
+
+def test_a_single_anchor_far_from_its_place_is_found(flights):
+    given = flights[0].anchors
+    off = np.zeros_like(given.positions)
+    off[3] = 0.9, -0.7, 0.3
+    calibration = StreamCalibration(given.at(given.positions + off), Tape(0.03))
+    wrong = [replace(one, anchors=calibration.given) for one in flights[:2]]
+    steps = taken_all(calibration, wrong)
+    assert any(step.taken for step in steps)
+    anchors, _ = in_place(calibration.given, calibration.effects)
+    assert np.linalg.norm(anchors.positions[3] - given.positions[3]) < 0.5
 
 
 def test_anchors_without_an_estimate_are_not_taken(flights, monkeypatch):
@@ -183,9 +227,9 @@ def test_anchors_without_an_estimate_are_not_taken(flights, monkeypatch):
 def test_an_unknown_anchor_is_placed_once(flights, monkeypatch):
     tapes = []
 
-    def instead(given, tape, *more):
+    def instead(given, tape, **more):
         tapes.append(tape)
-        return real(given, tape, *more)
+        return real(given, tape, **more)
 
     real = stream.self_calibrate
     monkeypatch.setattr(stream, "self_calibrate", instead)

@@ -9,7 +9,6 @@ by more than it leaves unknown; until then, the next piece goes on from it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,7 +24,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import path_by_anchors, slow_innovations
 from ..diagnosis.self_calibration.prior import with_calibration
-from ..diagnosis.self_calibration.solve import LEFT, AnchorChange
+from ..diagnosis.self_calibration.solve import CLEARLY, LEFT
 
 PIECE = 35.0  # s; a solution needs 30 s of motion, and a change three pieces at most
 SMALLEST_RATIO = 1.5  # of the slow innovations after and before a change of the anchors
@@ -87,9 +86,8 @@ class StreamCalibration:
         """
         self.given, self.effects, self.number = given, effects, 0
         self._tape, self._config = tape, config
-        self._further = (
-            effects  # from which the next solution goes on: it may not be good enough yet
-        )
+        # the next solution goes on from this one, which may not be good enough yet
+        self._further = effects
         self._candidates: list[SelfCalibration] = []
         self._waiting: list[Flight] = []
         self._levels: list[float] = []  # m, slow innovations on the last pieces
@@ -105,17 +103,16 @@ class StreamCalibration:
         text, after, taken = "nothing to judge yet", np.nan, False
         further, self._further = self._further, self.effects
         for candidate in self._candidates:
-            why_not = _refusal(candidate)
+            after = np.nan
             try:
                 effects = with_calibration(
                     further, candidate.found(candidate.shifts), candidate.covariance
                 )
-                if why_not is None:
-                    after = self._slow(piece, effects)
-                    why_not = self._reason_against(changed, before, after)
-                if why_not is None and self.effects.covariance is None:
+                after = self._slow(piece, effects)
+                why_not = self._reason_against(candidate, changed, before, after)
+                if self.effects.covariance is None and after <= before and not candidate.changes:
                     self._further = effects
-                    why_not = self._too_little(piece, effects, after)
+                    why_not = why_not or self._too_little(piece, effects, after)
             except InputError as error:  # these anchors give no estimate
                 why_not = str(error)
             if why_not is not None:
@@ -124,7 +121,7 @@ class StreamCalibration:
             else:
                 self.effects = self._further = effects
                 self.number, taken = self.number + 1, True
-                changes = [change.as_text() for change in _changes(candidate)]
+                changes = [change.as_text() for change in candidate.changes]
                 text = "; ".join([f"calibration {self.number} is in use", *changes])
                 break
         if self.effects.covariance is not None:
@@ -149,9 +146,8 @@ class StreamCalibration:
         try:
             spread = solve(replace(tape, steady=True))
             self._candidates = [spread]
-            if changed or (
-                not known and spread.why_not
-            ):  # a change of single anchors is judged first
+            # a change of single anchors is judged first
+            if changed or (self.effects.covariance is None and spread.why_not):
                 self._candidates = [solve(replace(tape, steady=False)), spread]
         except InputError as error:
             text = f"; no new solution: {error}"
@@ -169,16 +165,25 @@ class StreamCalibration:
         anchors, others = in_place(self.given, effects)
         return slow_innovations([replace(piece, anchors=anchors)], others, self._config)
 
-    def _reason_against(self, changed: bool, before: float, after: float) -> str | None:
-        """Return why slow innovations on data that was not used forbid a candidate, or None.
+    def _reason_against(
+        self, candidate: SelfCalibration, changed: bool, before: float, after: float
+    ) -> str | None:
+        """Return why a candidate must not be used, or None.
 
         changed : whether these anchors have changed since the last calibration
-        before, after : m, slow innovations
+        before, after : m, slow innovations on data that was not used
         """
+        alone = {change.anchor for change in candidate.changes}
+        if self.effects.covariance is not None and len(alone) > MOST_CHANGED:
+            return f"more than {MOST_CHANGED} anchors have changed: survey them again"
+        if candidate.why_not is not None:
+            return candidate.why_not
         fall = f"slow innovations go from {100 * before:.1f} to {100 * after:.1f} cm"
         if self.effects.covariance is None:
             if after > LEFT:
                 return f"{fall}: more than {100 * LEFT:.1f} cm"
+            if alone and before < CLEARLY * after:
+                return f"{fall}: by less than a factor of {CLEARLY:g}, with one anchor elsewhere"
         if changed and after > SMALLEST_RATIO * self._level:
             return f"{fall}: not back to {100 * self._level:.1f} cm"
         return fall if after > before else None
@@ -206,18 +211,6 @@ class StreamCalibration:
         if share <= LARGEST_SHARE:
             return None
         return f"it is expected to leave {share:.0%} of the position error, more than {LARGEST_SHARE:.0%}"
-
-
-def _refusal(found: SelfCalibration) -> str | None:
-    """Return why a calibration is of no use on any data, or None."""
-    if len({change.anchor for change in _changes(found)}) > MOST_CHANGED:
-        return f"more than {MOST_CHANGED} anchors have changed: survey them again"
-    return found.why_not
-
-
-def _changes(found: SelfCalibration) -> Sequence[AnchorChange]:
-    """Return the changes of single anchors since the calibration before, if there is one."""
-    return () if found.base.covariance is None else found.changes
 
 
 def in_place(given: Anchors, effects: EffectSet) -> tuple[Anchors, EffectSet]:
