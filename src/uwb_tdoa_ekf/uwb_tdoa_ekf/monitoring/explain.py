@@ -1,6 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Measure how well any motion explains a stream of TDOAs, by the innovations of an IMU-free filter.
+"""Measure how well any motion, or place, explains TDOAs.
+
+A stream is judged by the innovations of an IMU-free filter. TDOAs that are heard together, a
+snapshot, are judged at the best position of the tag (`locate`).
 
 Two hypotheses about one stream, for example right and wrong signs, are compared block by block by
 their unexplained loss. Systematic errors affect both, so the difference is more significant than
@@ -14,8 +17,11 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import compiled
+
 from ..core.config import FilterConfig
 from ..core.engine import feed
+from ..core.ground import solve
 from ..core.memory import IMU_SAMPLE, FilterState, Measurements, new_state, usable_tdoas
 
 SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
@@ -23,8 +29,18 @@ SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size ha
 BLOCK = 2.0
 # a block with this many TDOAs or fewer does not count; smallest number of blocks
 FEW, LEAST = 10, 4
+# number of Gauss-Newton steps; longest step relative to the room
+STEPS, NEAR = (8, 0.3)
+# Anchors in a plane or in a line: start positions spread across it, too, by this share of their size.
+# On it, no derivative leads away from it.
+THIN = 0.4
+STARTS = np.array(
+    [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
+)
 CONFIG = FilterConfig(use_imu=False)
 NO_IMU = np.empty(0, IMU_SAMPLE)
+
+Snapshot = tuple[np.ndarray, np.ndarray]  # rows of both anchors (k, 2), and TDOAs (k,) m
 
 
 @dataclass(frozen=True)
@@ -174,3 +190,65 @@ def _loss(innovation: np.ndarray) -> np.ndarray:
     """Return the Geman-McClure loss of innovations (n,), in m: (n,), 0 to 1; not finite gives 1."""
     square = np.where(np.isfinite(innovation), innovation, np.inf) ** 2
     return 1.0 - SCALE**2 / (SCALE**2 + square)
+
+
+@compiled
+def locate(ends: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray) -> float:
+    """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
+
+    The search is a robust Gauss-Newton iteration from several starts, during which the scale of the
+    loss decreases.
+
+    Parameters
+    ----------
+    ends : (k, 2, 3) array
+        Positions of both anchors of each TDOA, in m.
+    d : (k,) array
+        TDOAs, in m.
+    starts : (s, 3) array
+        Start positions, in half sizes of the room.
+    place : (3,) array
+        Filled with the best position, in m.
+    """
+    n, low, high = len(d), np.empty(3), np.empty(3)
+    for j in range(3):  # corners of the room around the anchors
+        low[j], high[j] = ends[:, :, j].min(), ends[:, :, j].max()
+    size = math.sqrt(np.sum((high - low) ** 2))
+    least, p, gradient = np.inf, np.empty(3), np.empty(3)
+    normal = np.empty((3, 4))  # normal equations, the right side in the last column
+    for start in range(len(starts)):
+        for j in range(3):
+            across = max(high[j] - low[j], THIN * size)
+            p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * across
+        for step in range(STEPS + 1):  # the last one evaluates the loss only
+            scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
+            normal[:, :] = 0.0
+            for i in range(n):
+                residual = d[i]  # measured minus predicted
+                for side in range(2):
+                    length = 1e-18
+                    for j in range(3):
+                        length += (p[j] - ends[i, side, j]) ** 2
+                    length = math.sqrt(length)
+                    residual += length if side == 0 else -length
+                    for j in range(3):
+                        unit = (p[j] - ends[i, side, j]) / length
+                        gradient[j] = -unit if side == 0 else gradient[j] + unit
+                square = (residual / scale) ** 2
+                loss += square / (1.0 + square)
+                weight = 1.0 / (1.0 + square) ** 2
+                for j in range(3):
+                    for k in range(3):
+                        normal[j, k] += weight * gradient[j] * gradient[k]
+                    normal[j, 3] += weight * gradient[j] * residual
+            if step == STEPS:
+                if loss / n < least:
+                    least = loss / n
+                    place[:] = p
+                break
+            for j in range(3):
+                normal[j, j] += 1e-6
+            solve(normal)
+            length = math.sqrt(np.sum(normal[:, 3] ** 2))
+            p += min(1.0, NEAR * size / max(length, 1e-12)) * normal[:, 3]
+    return least

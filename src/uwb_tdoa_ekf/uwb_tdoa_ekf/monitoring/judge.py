@@ -12,22 +12,19 @@ A rival of a survey in another unit is the radio, whose errors depend on the pla
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import combinations, permutations, product
+from collections.abc import Sequence
+from itertools import combinations
 import math
 from typing import NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.common.anchors import UNITS, Anchors
-from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT
 
-from ..core.ground import solve
-from .anchor_watch import Piece, best_order
-from .explain import SCALE, compare_losses, in_words
+from .explain import STARTS, Snapshot, compare_losses, in_words, locate
 from .finding import ERROR, Finding
+from .mixed_ids import order_of_recording
 
 # most pairs of a snapshot; fewest anchors: three coordinates and a scale need four differences
 PAIRS, HEARD = (32, 5)
@@ -37,23 +34,9 @@ FEWEST, MANY, KEPT = (4, 10, 20)
 # most anchors for tests of each anchor and of each pair; it limits the work
 SINGLE = 12
 # An order of more than two ids must leave less than CLEARER of the loss of the best other hypothesis.
-# Each wrong id must explain EACH of the loss, or all together if they are counted from another one: in
-# a nearly symmetrical room several orders leave up to 3 % less than the right one.
-CLEARER, EACH = 0.95, 0.008
-# snapshots on which orders of ids are compared, to find some and to choose; orders that are improved;
-# places, in half sizes of the room, from which the search begins
-COMPARED, IMPROVED = (12, 60), 3
-PLACES = np.array(list(product((-0.6, 0.0, 0.6), (-0.6, 0.0, 0.6), (-0.5, 0.5))))
+CLEARER = 0.95
 # smallest factor, ratio of successive factors, largest factor
 SMALLEST, RATIO, LARGEST = (1.5, 1.25, 1500.0)
-# number of Gauss-Newton steps; longest step relative to the room
-STEPS, NEAR = (8, 0.3)
-# Anchors in a plane or in a line: start positions spread across it, too, by this share of their size.
-# On it, no derivative leads away from it.
-THIN = 0.4
-STARTS = np.array(
-    [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
-)
 # Largest share of the loss of each rival that may remain, and smallest number of standard errors of
 # the reduction; the same of the sign. Another scale, or another place of one anchor, explains a part
 # of any error: 0.84 of the loss remains for a tape with errors of 0.1 m. On 13 measured recordings,
@@ -70,9 +53,6 @@ MOVED, CLEARLY = (0.3, 0.5)
 # m per nanosecond; TDOAs in nanoseconds or feet look like a survey that is too small by this factor
 NANOSECONDS = SPEED_OF_LIGHT / 1e9
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
-
-
-Snapshot = tuple[np.ndarray, np.ndarray]  # rows of both anchors (k, 2), and TDOAs (k,) m
 
 
 class Hypothesis(NamedTuple):
@@ -127,8 +107,8 @@ class Judge:
         self._anchors = anchors
         self._hypotheses = _hypotheses(range(len(anchors)) if doubtful is None else doubtful)
         self._snapshots: deque[Snapshot] = deque(maxlen=kept)
-        self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) losses of each snapshot
-        self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) positions of the tag, in m
+        # loss and position of the tag, (3,) m, with each hypothesis, for each snapshot
+        self._found: deque[list[tuple[float, np.ndarray]]] = deque(maxlen=kept)
 
     def add(self, snapshot: np.ndarray) -> None:
         """Add TDOAs that were heard together, (k, 3): rows of both anchors, and value in m."""
@@ -137,9 +117,7 @@ class Judge:
         count = min(PAIRS, len(snapshot))
         some = snapshot[np.linspace(0, len(snapshot) - 1, count).round().astype(int)]
         self._snapshots.append((some[:, :2].astype(np.int64), some[:, 2].copy()))
-        found = [self._located(one, *self._snapshots[-1]) for one in self._hypotheses]
-        self._losses.append(np.array([loss for loss, _ in found]))
-        self._places.append(np.array([place for _, place in found]))
+        self._found.append([self._located(one, *self._snapshots[-1]) for one in self._hypotheses])
 
     def _located(
         self, one: Hypothesis, rows: np.ndarray, d: np.ndarray
@@ -152,52 +130,33 @@ class Judge:
     def forget(self) -> None:
         """Drop all snapshots, because from now on the TDOAs differ."""
         self._snapshots.clear()
-        self._losses.clear()
-        self._places.clear()
+        self._found.clear()
 
     def add_order(self) -> None:
         """Add the order of ids that explains all snapshots best to the hypotheses.
 
-        In flight the Monitor finds it sooner, by where the tag was before. Here the search begins at
-        places all over the room. The best orders are then improved by exchanges of two anchors.
+        In flight the Monitor finds it sooner, by where the tag was before.
         """
         surveyed = self._anchors.positions
-        if len(self._losses) < FEWEST or len(surveyed) > SINGLE or not self._best:
+        if len(self._found) < FEWEST or len(surveyed) > SINGLE or not self._best:
             return
-        low, high = surveyed.min(axis=0), surveyed.max(axis=0)
-        across = np.maximum(high - low, THIN * np.linalg.norm(high - low))
-        few, many = (
-            [self._snapshots[k] for k in np.linspace(0, len(self._snapshots) - 1, n).astype(int)]
-            for n in COMPARED
-        )
-
-        def loss(order: tuple[int, ...], some: Sequence[Snapshot] = few) -> float:
-            one = _of_order(order)
-            left = np.mean([self._located(one, *each)[0] for each in some])
-            turned = len({(at - row) % len(order) for row, at in enumerate(order)}) == 1
-            return float(left) * (1.0 + EACH * (1 if turned else len(one.rows)))
-
-        found = set()
-        for rows, d in few[::2]:
-            for begin in 0.5 * (low + high) + 0.5 * PLACES * across:
-                piece = Piece(rows[:, 0], rows[:, 1], d, begin, begin)
-                found.add(tuple(best_order(surveyed, [piece])[0].tolist()))
-        begun = [tuple(range(len(surveyed))), *sorted(found, key=loss)[:IMPROVED]]
-        likely = {image for order in begun for image in _images(_improved(order, loss), surveyed)}
-        of_many = partial(loss, some=many)
-        best = _improved(min(likely, key=of_many), of_many)
-        one, others = _of_order(best), float(np.mean(self._losses, axis=0).min())
-        if len(one.rows) > 2 and of_many(best) < CLEARER * others:
+        order, loss = order_of_recording(surveyed, self._snapshots)
+        if len(order) > 2 and loss < CLEARER * self._losses.mean(axis=0).min():
+            rows, at = zip(*order)
+            one = Hypothesis(EXCHANGED, rows=rows, at=at)
             self._hypotheses.append(one)
-            for number, each in enumerate(self._snapshots):
-                left, place = self._located(one, *each)
-                self._losses[number] = np.append(self._losses[number], left)
-                self._places[number] = np.vstack([self._places[number], place])
+            for each, found in zip(self._snapshots, self._found):
+                found.append(self._located(one, *each))
+
+    @property
+    def _losses(self) -> np.ndarray:
+        """Return the loss of each hypothesis on each snapshot, (k, h)."""
+        return np.array([[loss for loss, _ in found] for found in self._found])
 
     @property
     def full(self) -> bool:
         """Return whether it holds as many snapshots as it keeps."""
-        return len(self._losses) == self._losses.maxlen
+        return len(self._found) == self._found.maxlen
 
     @property
     def finding(self) -> Finding | None:
@@ -205,7 +164,7 @@ class Judge:
         best = self._named()
         if best is None:
             return None
-        found, losses = self._hypotheses[best], np.array(self._losses)
+        found, losses = self._hypotheses[best], self._losses
         rival, own = self._against(best)
         left, z = compare_losses(rival, own)
         evidence = f"{in_words(left, z)}, in {len(own)} snapshots"
@@ -234,7 +193,7 @@ class Judge:
     @property
     def order(self) -> dict[int, int]:
         """Return {id as received: id of that anchor} if other ids explain more than any mistake, or {}."""
-        found = self._hypotheses[self._best] if self._losses else Hypothesis(AS_IT_IS)
+        found = self._hypotheses[self._best] if self._found else Hypothesis(AS_IT_IS)
         rows, at = (
             self._anchors.ids[list(some)].tolist() if found.kind == EXCHANGED else []
             for some in (found.rows, found.at)
@@ -244,18 +203,18 @@ class Judge:
     @property
     def _best(self) -> int:
         """Return the number of the hypothesis that leaves least; 0 is the survey as it is."""
-        return int(np.argmin(np.mean(self._losses, axis=0)))
+        return int(np.argmin(self._losses.mean(axis=0)))
 
     def _named(self) -> int | None:
         """Return the number of the hypothesis of a mistake that beats every rival, or None."""
-        if len(self._losses) < FEWEST:
+        if len(self._found) < FEWEST:
             return None
         best = self._best
         kind = self._hypotheses[best].kind
         if kind == AS_IT_IS or not self._beats(best):
             return None
         clearly = kind != SIGN and self._beats(best, share=CLEARLY)
-        moved = len(self._losses) >= MANY and self._spread_of(best) > MOVED
+        moved = len(self._found) >= MANY and self._spread_of(best) > MOVED
         return best if clearly or moved else None
 
     def _beats(self, best: int, share: float = LEFT) -> bool:
@@ -291,7 +250,7 @@ class Judge:
 
         They are of the snapshots in which it changes anything: a tag hears a part of a hall.
         """
-        mine, losses = self._hypotheses[best], np.array(self._losses)
+        mine, losses = self._hypotheses[best], self._losses
         told = losses[:, best] != losses[:, 0]
         same = [(one.kind, one.rows) == (mine.kind, mine.rows) for one in self._hypotheses]
         rival = int(np.argmin(np.where(same, np.inf, losses.mean(axis=0))))
@@ -299,7 +258,7 @@ class Judge:
 
     def _spread_of(self, number: int) -> float:
         """Return the root mean square distance of the tag from its median place, in m."""
-        places = np.array([places[number] for places in self._places])
+        places = np.array([found[number][1] for found in self._found])
         off = places - np.median(places, axis=0)
         return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
 
@@ -378,98 +337,3 @@ def _hypotheses(doubtful: Sequence[int]) -> list[Hypothesis]:
             Hypothesis(EXCHANGED, rows=rows, at=rows[::-1]) for rows in combinations(doubtful, 2)
         ]
     return made
-
-
-def _of_order(order: Sequence[int]) -> Hypothesis:
-    """Return the Hypothesis that anchor k is at the place of order[k]."""
-    rows = tuple(row for row, at in enumerate(order) if row != at)
-    return Hypothesis(EXCHANGED, rows=rows, at=tuple(order[row] for row in rows))
-
-
-def _images(order: tuple[int, ...], surveyed: np.ndarray) -> list[tuple[int, ...]]:
-    """Return the orders that a nearly symmetrical room hardly distinguishes from `order`.
-
-    surveyed : (N, 3) places of the anchors, in m
-    """
-    off, images = surveyed - 0.5 * (surveyed.min(axis=0) + surveyed.max(axis=0)), [order]
-    for axes, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
-        away = np.linalg.norm((off[:, list(axes)] * signs)[:, None] - off, axis=2)
-        nearest = away.argmin(axis=1)
-        if len(set(nearest.tolist())) == len(surveyed):
-            images.append(tuple(nearest[list(order)].tolist()))
-    return images
-
-
-def _improved(order: tuple[int, ...], loss: Callable[[tuple[int, ...]], float]) -> tuple[int, ...]:
-    """Return an order that no exchange of two anchors improves, from `order` on."""
-    least, better = loss(order), order
-    while better:
-        order, better = better, ()
-        for one, other in combinations(range(len(order)), 2):
-            trial = [*order]
-            trial[one], trial[other] = order[other], order[one]
-            if (left := loss(tuple(trial))) < least:
-                least, better = left, tuple(trial)
-    return order
-
-
-@compiled
-def locate(ends: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray) -> float:
-    """Return the mean Geman-McClure loss, 0 to 1, at the best position of the tag.
-
-    The search is a robust Gauss-Newton iteration from several starts, during which the scale of the
-    loss decreases.
-
-    Parameters
-    ----------
-    ends : (k, 2, 3) array
-        Positions of both anchors of each TDOA, in m.
-    d : (k,) array
-        TDOAs, in m.
-    starts : (s, 3) array
-        Start positions, in half sizes of the room.
-    place : (3,) array
-        Filled with the best position, in m.
-    """
-    n, low, high = len(d), np.empty(3), np.empty(3)
-    for j in range(3):  # corners of the room around the anchors
-        low[j], high[j] = ends[:, :, j].min(), ends[:, :, j].max()
-    size = math.sqrt(np.sum((high - low) ** 2))
-    least, p, gradient = np.inf, np.empty(3), np.empty(3)
-    normal = np.empty((3, 4))  # normal equations, the right side in the last column
-    for start in range(len(starts)):
-        for j in range(3):
-            across = max(high[j] - low[j], THIN * size)
-            p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * across
-        for step in range(STEPS + 1):  # the last one evaluates the loss only
-            scale, loss = max(0.3 * size * 0.5**step, SCALE) if step < STEPS else SCALE, 0.0
-            normal[:, :] = 0.0
-            for i in range(n):
-                residual = d[i]  # measured minus predicted
-                for side in range(2):
-                    length = 1e-18
-                    for j in range(3):
-                        length += (p[j] - ends[i, side, j]) ** 2
-                    length = math.sqrt(length)
-                    residual += length if side == 0 else -length
-                    for j in range(3):
-                        unit = (p[j] - ends[i, side, j]) / length
-                        gradient[j] = -unit if side == 0 else gradient[j] + unit
-                square = (residual / scale) ** 2
-                loss += square / (1.0 + square)
-                weight = 1.0 / (1.0 + square) ** 2
-                for j in range(3):
-                    for k in range(3):
-                        normal[j, k] += weight * gradient[j] * gradient[k]
-                    normal[j, 3] += weight * gradient[j] * residual
-            if step == STEPS:
-                if loss / n < least:
-                    least = loss / n
-                    place[:] = p
-                break
-            for j in range(3):
-                normal[j, j] += 1e-6
-            solve(normal)
-            length = math.sqrt(np.sum(normal[:, 3] ** 2))
-            p += min(1.0, NEAR * size / max(length, 1e-12)) * normal[:, 3]
-    return least

@@ -34,19 +34,15 @@ from .anchor_watch import (
     Change,
     ChangeDetector,
     Displaced,
-    Order,
-    Piece,
     Slice,
     SurveyComparison,
-    clear_order,
     reduced,
-    residuals as residuals_of,
-    suspects,
     turned,
 )
 from .finding import WARNING, Finding
 from .inertial_rules import AXES
 from .judge import exchanged
+from .mixed_ids import Order, Piece, clear_order, residuals as residuals_of, suspects
 
 # m/s, speed above which the tag is in motion; on the floor, residuals differ from those in the air
 MOVING = 0.3
