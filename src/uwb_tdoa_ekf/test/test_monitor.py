@@ -15,15 +15,14 @@ from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_ekf.core.memory import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.anchor_watch import (
-    CAPACITY,
     LENGTH,
     MOST,
-    ChangeDetector,
     Displaced,
     SurveyComparison,
     reduced,
     smooth_functions,
 )
+from uwb_tdoa_ekf.monitoring.change_detector import CAPACITY, ChangeDetector
 from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _matters, _surest, watched
 from uwb_tdoa_ekf.results import concatenated
 

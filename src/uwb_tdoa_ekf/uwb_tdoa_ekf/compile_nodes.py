@@ -28,7 +28,8 @@ from uwb_tdoa_bias.effects.samples import ImuFeatures
 from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .estimator import Estimator
-from .monitoring.anchor_watch import LENGTH, YOUNGEST, ChangeDetector, Slice
+from .monitoring.anchor_watch import LENGTH, Slice
+from .monitoring.change_detector import YOUNGEST, ChangeDetector
 from .monitoring.judge import Judge
 from .monitoring.stream_rules import StreamWatch
 from .results import pose_and_twist, rotation_std

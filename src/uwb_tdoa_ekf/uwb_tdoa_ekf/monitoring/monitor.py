@@ -29,16 +29,8 @@ from ..anchor_table import AnchorTable
 from ..core.initialization import LOST_TIME
 from ..core.memory import REJECTED
 from ..results import Odometry, Residuals, concatenated, rows_of
-from .anchor_watch import (
-    LENGTH,
-    Change,
-    ChangeDetector,
-    Displaced,
-    Slice,
-    SurveyComparison,
-    reduced,
-    turned,
-)
+from .anchor_watch import LENGTH, Displaced, Slice, SurveyComparison, reduced, turned
+from .change_detector import Change, ChangeDetector
 from .finding import WARNING, Finding
 from .inertial_rules import AXES
 from .judge import exchanged
