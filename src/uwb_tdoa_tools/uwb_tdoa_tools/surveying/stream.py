@@ -196,10 +196,7 @@ class StreamCalibration:
         """
         covariance, (anchors, others) = effects.covariance, in_place(self.given, effects)
         assert covariance is not None  # as of a calibration
-        after, before = (
-            {(one.name, key): value for one in some for key, value in one.values.items()}
-            for some in (effects, self.effects)
-        )
+        after, before = map(_values, (effects, self.effects))
         change = [after[key] - before.get(key, 0.0) for key in covariance.keys]
         unknown = covariance.matrix + np.diag(
             [slow**2 if effect == AnchorDelay.name else 0.0 for effect, _ in covariance.keys]
@@ -211,6 +208,11 @@ class StreamCalibration:
         if share <= LARGEST_SHARE:
             return None
         return f"it is expected to leave {share:.0%} of the position error, more than {LARGEST_SHARE:.0%}"
+
+
+def _values(effects: EffectSet) -> dict[tuple[str, ...], float]:
+    """Return {(effect, parameter): value}."""
+    return {(one.name, key): value for one in effects for key, value in one.values.items()}
 
 
 def in_place(given: Anchors, effects: EffectSet) -> tuple[Anchors, EffectSet]:
