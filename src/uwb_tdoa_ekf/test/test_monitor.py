@@ -301,6 +301,22 @@ def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypa
     assert kept == [(), one, (), other] and named.count(one) > 12
 
 
+@pytest.mark.parametrize(
+    "order, remedy", [(((1, 2), (2, 1)), "id = {"), (((0, 1), (1, 2), (2, 0)), "let check name")]
+)
+def test_only_an_exchange_of_two_is_to_be_corrected_at_once(monkeypatch, order, remedy):
+    """In half of measured flights with more, another order was named for some time."""
+    left = {(): 1.0, order: 0.1, ((3, 4), (4, 3)): 0.9}, dict.fromkeys([(), order], np.zeros(3))
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.residuals_of", lambda *_: left)
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.suspects", lambda *_: {0, 1, 2, 3})
+    monitor = Monitor(ANCHORS)
+    for _ in range(12):
+        monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3), True)
+    found = monitor.exchanged
+    assert found is not None and remedy in found.remedy
+    assert ("id = " in found.remedy) == (len(order) == 2)
+
+
 @pytest.mark.parametrize("moving", [True, False])
 def test_a_tag_at_rest_shows_no_permutation(monkeypatch, moving):
     """After landings, where low anchors were late, a permutation of six ids was named."""

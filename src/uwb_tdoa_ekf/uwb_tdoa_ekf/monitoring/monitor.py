@@ -518,10 +518,14 @@ class Monitor:
     def _swap(self) -> Finding:
         ids = self._anchors.ids
         table = {int(ids[one]): int(ids[at]) for one, at in self._swapped}
-        evidence = "each TDOA with one of them fits the place of another"
-        if len(table) > 2:
-            evidence += "; in a nearly symmetrical room, another order fits, too"
-        return exchanged(table, evidence)
+        found = exchanged(table, "each TDOA with one of them fits the place of another")
+        if len(table) == 2:
+            return found
+        return replace(
+            found,
+            evidence="most TDOAs contradict the survey; in half of such flights another order is right",
+            remedy="record half a minute in motion with these ids, and let check name their order",
+        )
 
     def _silence(self, row: int) -> Finding:
         number = self._anchors.ids[row]
