@@ -195,6 +195,32 @@ def test_a_first_calibration_that_tells_too_little_is_continued(flights, monkeyp
     assert rmse(flights[2], calibration.effects) < 0.5 * rmse(flights[2], EffectSet())
 
 
+def test_too_little_motion_does_not_lose_what_was_found(flights, monkeypatch):
+    monkeypatch.setattr(stream, "LARGEST_SHARE", 0.0)
+    calibration = StreamCalibration(flights[0].anchors, Tape(TAPE))
+    first, second = in_pieces(flights[0])
+    calibration.take(first)
+    short = between(second, second.start, second.start + 15.0)
+    assert "no new solution" in calibration.take(short).text
+    found = calibration._further
+    assert len(found) and not len(calibration.effects)
+    calibration.take(short)
+    assert calibration._further is found
+
+
+def test_the_order_of_a_covariance_does_not_matter(calibrated, flights, monkeypatch):
+    monkeypatch.setattr(stream, "LARGEST_SHARE", 0.0)
+    effects, piece = calibrated[0].effects, next(in_pieces(flights[2]))
+    known = effects.covariance
+    turned = replace(known, keys=known.keys[::-1], matrix=known.matrix[::-1, ::-1])
+    judge = StreamCalibration(flights[0].anchors, Tape(TAPE))
+    one, other = (
+        judge._too_little(piece, replace(effects, covariance=some), 0.02)
+        for some in (known, turned)
+    )
+    assert one == other and "is expected to leave" in one
+
+
 def test_a_single_anchor_far_from_its_place_is_found(flights):
     given = flights[0].anchors
     off = np.zeros_like(given.positions)

@@ -20,6 +20,7 @@ from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.evidence import keys_of
 
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import path_by_anchors, slow_innovations
@@ -101,9 +102,9 @@ class StreamCalibration:
         changed = bool(before > SMALLEST_RATIO * self._level)
         refusals: list[str] = []
         text, after, taken = "nothing to judge yet", np.nan, False
-        further, self._further = self._further, self.effects
+        further = self._further
         for candidate in self._candidates:
-            after = np.nan
+            after, self._further = np.nan, self.effects
             try:
                 effects = with_calibration(
                     further, candidate.found(candidate.shifts), candidate.covariance
@@ -194,13 +195,13 @@ class StreamCalibration:
         The position errors with it and with the anchors as given differ by what it moves the path. What it
         leaves is unknown: as its covariance says, and of each anchor as much as the slow innovations, m.
         """
-        covariance, (anchors, others) = effects.covariance, in_place(self.given, effects)
-        assert covariance is not None  # as of a calibration
+        anchors, others = in_place(self.given, effects)
+        assert effects.covariance is not None  # as of a calibration
+        keys = keys_of(anchors.ids)
         after, before = map(_values, (effects, self.effects))
-        change = [after[key] - before.get(key, 0.0) for key in covariance.keys]
-        unknown = covariance.matrix + np.diag(
-            [slow**2 if effect == AnchorDelay.name else 0.0 for effect, _ in covariance.keys]
-        )
+        change = [after[key] - before.get(key, 0.0) for key in keys]
+        late = [slow**2 if effect == AnchorDelay.name else 0.0 for effect, _ in keys]
+        unknown = effects.covariance.of(keys)[1] + np.diag(late)
         by_anchors = path_by_anchors(replace(piece, anchors=anchors), others, self._config)
         moved = sum(np.sum((one @ change) ** 2) for one in by_anchors)
         left = sum(np.trace(one @ unknown @ one.T) for one in by_anchors)
