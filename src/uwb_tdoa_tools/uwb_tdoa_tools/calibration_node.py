@@ -82,7 +82,7 @@ PARAMETERS = {  # in the order of config/calibration_node.yaml
     ),
 }
 HAND_OVER, STEP = 5.0, 0.25  # s, of a new calibration, and between the messages of it
-NICE = 5  # of its process: odometry comes first, but two busy programs must not cost it TDOAs
+NICE = 5  # of its process: the odometry comes first, see docs/notebook/calibration.md
 REST = 0.05  # s between two turns: nobody waits for this node
 MOST_PIECES = 2  # pieces that wait for the process
 

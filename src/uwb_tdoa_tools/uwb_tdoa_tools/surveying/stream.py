@@ -87,7 +87,7 @@ class StreamCalibration:
         """
         self.given, self.effects, self.number = given, effects, 0
         self._tape, self._config = tape, config
-        # the next solution goes on from this one, which may not be good enough yet
+        # the next solution starts from this calibration; it may not be good enough to be used
         self._further = effects
         self._candidates: list[SelfCalibration] = []
         self._waiting: list[Flight] = []

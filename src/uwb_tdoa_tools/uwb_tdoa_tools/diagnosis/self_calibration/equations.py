@@ -110,8 +110,8 @@ def path_by_anchors(
 ) -> list[np.ndarray]:
     """Return derivatives of the position in each BLOCK by anchors, [(3, 4N)].
 
-    They are by all coordinates, anchor by anchor, then by all delays. An error of the position is taken as
-    constant in a block, and as the one that fits its TDOAs and ranges best. Ground truth is not used.
+    They are by all coordinates, anchor by anchor, then by all delays. In a block the error of the position is
+    constant, and fits the TDOAs best, or the ranges: both are returned. Ground truth is not used.
     """
     runs, anchors = Runs([flight], effects, config), flight.anchors
     _, parts = _residuals(
