@@ -43,8 +43,6 @@ IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_ind
 KEYS = {
     "backports": (None, "backports.zstd"),  # installed with rosbags, like lz4
     "cflib": (None, "cflib"),  # for protocol crazyflie
-    "dask": (None, "distributed"),
-    "distributed": (None, "distributed"),
     "hypothesis": ("python3-hypothesis", "hypothesis"),
     "jinja2": ("python3-jinja2", "Jinja2"),
     "joblib": ("python3-joblib", "joblib"),

@@ -67,7 +67,7 @@ def test_what_leads_to_other_machines_is_locked():
     """Every optional package that has a link, and all that it needs, in the versions of the rest."""
     optional, rest = locked(".dev/optional.lock"), locked(".dev/requirements.lock")
     extras = (ROOT / "pyproject.toml").read_text().partition("[project.optional-dependencies]")[2]
-    for extra in ("crazyflie", "dask", "mavlink"):
+    for extra in ("crazyflie", "mavlink"):
         (line,) = re.findall(rf"^{extra} = .*", extras, re.M)
         assert {*re.findall(r'"([a-z]+)>=', line)} <= optional.keys()
     (other,) = {name for name in optional.keys() & rest if optional[name] != rest[name]}

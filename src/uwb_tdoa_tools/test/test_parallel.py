@@ -139,13 +139,9 @@ def options(*argv):
 
 
 def test_few_items_run_in_one_process_by_default():
-    assert parallel.workers_for(options(), 4, 5)[:2] == (1, None)
-    assert parallel.workers_for(options(), 5, 5)[:2] == (min(cpu_count(), 5), None)
-    assert parallel.workers_for(options("--jobs", "2"), 4, 5)[:2] == (2, None)
-    assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5)[:2] == (
-        None,
-        "tcp://here:1",
-    )
+    assert parallel.workers_for(options(), 4, 5)[0] == 1
+    assert parallel.workers_for(options(), 5, 5)[0] == min(cpu_count(), 5)
+    assert parallel.workers_for(options("--jobs", "2"), 4, 5)[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -153,77 +149,12 @@ def test_few_items_run_in_one_process_by_default():
     [
         (["--jobs", "0"], "'0' is not a whole number above 0"),
         (["--jobs", "two"], "'two' is not a whole number above 0"),
-        (["--jobs", "2", "--dask", "tcp://here:1"], "not allowed with"),
     ],
 )
 def test_bad_options(argv, sentence, capsys):
     with pytest.raises(SystemExit):
         options(*argv)
     assert sentence in capsys.readouterr().err
-
-
-def test_without_dask_the_error_names_what_to_install(monkeypatch):
-    monkeypatch.setitem(sys.modules, "dask.distributed", None)
-    with pytest.raises(InputError, match="--dask: needs dask.distributed, which is not installed"):
-        list(parallel.over(times_ten, [1, 2], dask="tcp://127.0.0.1:1"))
-
-
-def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
-    pytest.importorskip("dask.distributed")
-    with pytest.raises(InputError, match="--dask: no scheduler answers at nowhere"):
-        list(parallel.over(times_ten, [1, 2], dask="nowhere"))
-
-
-@pytest.mark.parametrize(
-    ("address", "said"),
-    [("tcp://10.0.0.1:8786", 1), ("ucx://10.0.0.2:1", 1), ("tls://10.0.0.1:8786", 0)],
-)
-def test_an_unencrypted_connection_is_reported_once(address, said, capsys):
-    parallel._say_whom_it_trusts.cache_clear()
-    for _ in range(2):
-        parallel._say_whom_it_trusts(address)
-    err = capsys.readouterr().err
-    assert (
-        err.count(f"--dask: {address} is not encrypted: whoever reaches it")
-        == err.count("\n")
-        == said
-    )
-
-
-def test_an_encrypted_cluster_needs_the_certificates_of_dask(importable, capsys):
-    distributed = pytest.importorskip("dask.distributed")
-    dask = pytest.importorskip("dask")
-    pytest.importorskip("cryptography")
-    security = distributed.Security.temporary()
-    parallel._say_whom_it_trusts.cache_clear()
-    with distributed.LocalCluster(
-        1, threads_per_worker=1, dashboard_address=None, security=security
-    ) as cluster:
-        address = cluster.scheduler_address
-        with pytest.raises(InputError, match="no scheduler answers"):  # without certificates
-            list(parallel.over(times_ten, range(3), dask=address))
-        tls = {
-            "ca-file": security.tls_ca_file,
-            "client.cert": security.tls_client_cert,
-            "client.key": security.tls_client_key,
-        }
-        names = {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
-        with dask.config.set(names):
-            assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
-    assert "is not encrypted" not in capsys.readouterr().err
-
-
-def test_a_dask_cluster_gives_the_same_results_and_errors(importable, capsys):
-    distributed = pytest.importorskip("dask.distributed")
-    parallel._say_whom_it_trusts.cache_clear()
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
-        address = cluster.scheduler_address
-        assert list(parallel.over(times_ten, range(7), dask=address)) == [10 * k for k in range(7)]
-        here, *others = parallel.over(process, range(6), dask=address)
-        assert here == os.getpid() and here not in others
-        with pytest.raises(InputError, match="3 is too few"):
-            list(parallel.over(refuse_three, range(6), dask=address))
-    assert "is not encrypted" in capsys.readouterr().err
 
 
 class Lines(io.StringIO):

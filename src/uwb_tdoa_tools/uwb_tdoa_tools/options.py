@@ -18,7 +18,7 @@ from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import choices
 from .choices import ALIGN, NONE, STORAGES
-from .cli import Option, OutputFolder, exclusive, option
+from .cli import Option, OutputFolder, option
 from .parallel import whole_number
 
 if TYPE_CHECKING:
@@ -130,22 +130,12 @@ KNOWN = (
     ),
     DISTANCES,
 )
-JOBS = exclusive(
-    option(
-        "--jobs",
-        metavar="N",
-        type=whole_number,
-        help="flights at once (default: as many as there are cores)",
-    ),
-    option(
-        "--dask",
-        metavar="ADDRESS",
-        help="run on the Dask cluster whose scheduler is there, e.g. tcp://10.0.0.1:8786; its "
-        "workers need these "
-        "packages, and the recordings at the same paths; tls://... takes the certificates of "
-        "Dask's configuration",
-    ),
-)  # of tools that run over many flights
+JOBS = option(  # of tools that run over many flights
+    "--jobs",
+    metavar="N",
+    type=whole_number,
+    help="flights at once (default: as many as there are cores)",
+)
 
 
 def recordings(nargs: str = "+") -> tuple[Option, ...]:

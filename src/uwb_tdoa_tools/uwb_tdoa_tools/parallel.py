@@ -1,8 +1,8 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Run one function over many flights, on every core or on an existing Dask cluster.
+"""Run one function over many flights, on every core.
 
-    for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
+    for row in parallel.over(judge, found, args.jobs):        # in the order of `found`
         ...
 
 The processes are kept for later calls if each call ends normally. A caller that stops before the
@@ -14,10 +14,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
-from functools import cache, partial
+from functools import partial
 import os
 import signal
-import sys
 from typing import Any, Protocol, TypeVar
 import warnings
 
@@ -28,7 +27,6 @@ from .cli import Item, Progress
 
 Made = TypeVar("Made")
 
-CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 # flights; what fewer gain by other processes, these take to start (docs/notebook/speed.md)
 FEW = 20
 
@@ -44,10 +42,8 @@ class MapFunction(Protocol):
     ) -> Iterable[Made]: ...
 
 
-def workers_for(
-    args: argparse.Namespace, count: int, few: int = FEW
-) -> tuple[int | None, str | None, MapFunction]:
-    """Return (jobs, dask) for several calls of `over`, about `count` items, and `over` with these.
+def workers_for(args: argparse.Namespace, count: int, few: int = FEW) -> tuple[int, MapFunction]:
+    """Return the jobs for several calls of `over`, about `count` items, and `over` with these.
 
     That `over` shows no progress.
 
@@ -55,17 +51,14 @@ def workers_for(
     """
     from joblib import cpu_count
 
-    jobs, dask = args.jobs, args.dask
-    if not (jobs or dask):
-        jobs = min(cpu_count(), count) if count >= few else 1
-    return jobs, dask, partial(over, jobs=jobs, dask=dask, unit=None)
+    jobs = args.jobs or (min(cpu_count(), count) if count >= few else 1)
+    return jobs, partial(over, jobs=jobs, unit=None)
 
 
 def over(
     function: Callable[[Item], Made],
     items: Iterable[Item],
     jobs: int | None = None,
-    dask: str | None = None,
     unit: str | None = "flight",
 ) -> Iterator[Made]:
     """Yield function(item) for every item, in order, and show how many are done.
@@ -81,68 +74,57 @@ def over(
         Arguments, one for each call.
     jobs : int or None
         Number of processes; default one per core, at most one per item.
-    dask : str or None
-        Address of a Dask scheduler.
     unit : str or None
         Name of an item in the progress; None shows no progress.
-
-    Raises
-    ------
-    InputError
-        If the Dask scheduler does not answer.
     """
     items = list(items)
     with Progress(total=len(items), unit=unit) if unit and items else nullcontext() as progress:
-        for result in _results(function, items, jobs, dask):
+        for result in _results(function, items, jobs):
             if progress is not None:
                 progress.update()
             yield result
 
 
 def _results(
-    function: Callable[[Item], Made], items: list[Item], jobs: int | None, dask: str | None
+    function: Callable[[Item], Made], items: list[Item], jobs: int | None
 ) -> Iterator[Made]:
     """Yield the results of `over` in order.
 
     The first item runs here while the processes start and import `function`. So numba fills its
     cache once. The others run there.
     """
-    from joblib import Parallel, cpu_count, delayed, parallel_config
+    from joblib import Parallel, cpu_count, delayed
 
     first, rest = items[:1], items[1:]
     # Always exactly `jobs` if given: with another number, joblib restarts all processes.
     processes = jobs or min(cpu_count(), len(rest))
     # one process would be enough: stay here
-    if not rest or (min(processes, len(rest)) == 1 and dask is None):
+    if min(processes, len(rest)) <= 1:
         yield from map(function, items)
         return
     # Processes that joblib starts later import nothing from their working directory (Python 3.11).
     # `outside_present_folder` below does so for those that it starts now.
     os.environ["PYTHONSAFEPATH"] = "1"
-    with _cluster(dask) as backend:
 
-        def run_in_pool(calls: Iterable[Any]) -> Any:
-            with parallel_config(**backend):  # not around a yield: the caller may use joblib too
-                # Arrays are not mapped from files: numba compiles again for read-only arrays.
-                pool = Parallel(processes, return_as="generator", batch_size=1, max_nbytes=None)
-            # joblib starts Python by -m, which looks for modules in the present folder.
-            with _children_ignore_interrupts(), executable.outside_present_folder():
-                return pool(calls)
+    def run_in_pool(calls: Iterable[Any]) -> Any:
+        # Arrays are not mapped from files: numba compiles again for read-only arrays.
+        pool = Parallel(processes, return_as="generator", batch_size=1, max_nbytes=None)
+        # joblib starts Python by -m, which looks for modules in the present folder.
+        with _children_ignore_interrupts(), executable.outside_present_folder():
+            return pool(calls)
 
-        folder = os.getcwd() if dask is None else None
-        with _closing(
-            run_in_pool(delayed(_warm_up)(function) for _ in range(processes))
-        ) as warm_ups:
-            yield from map(function, first)
-            for _ in warm_ups:
-                pass  # wait until all have imported it
-        with _closing(
-            run_in_pool(delayed(_attempt)(function, item, folder) for item in rest)
-        ) as outcomes:
-            for result, error in outcomes:
-                if error is not None:
-                    raise error
-                yield result
+    folder = os.getcwd()
+    with _closing(run_in_pool(delayed(_warm_up)(function) for _ in range(processes))) as warm_ups:
+        yield from map(function, first)
+        for _ in warm_ups:
+            pass  # wait until all have imported it
+    with _closing(
+        run_in_pool(delayed(_attempt)(function, item, folder) for item in rest)
+    ) as outcomes:
+        for result, error in outcomes:
+            if error is not None:
+                raise error
+            yield result
 
 
 def _warm_up(function: Callable[..., object]) -> None:
@@ -163,15 +145,14 @@ def _closing(outcomes: Any) -> Iterator[Any]:
 
 
 def _attempt(
-    function: Callable[[Item], Made], item: Item, folder: str | None
+    function: Callable[[Item], Made], item: Item, folder: str
 ) -> tuple[Made | None, Exception | None]:
     """Return (result, None), or (None, an InputError or OSError): joblib would raise it too early.
 
-    folder : folder of relative paths in the item, or None.
+    folder : folder of relative paths in the item.
     """
     try:
-        if folder is not None:
-            os.chdir(folder)
+        os.chdir(folder)
         return function(item), None
     except (InputError, OSError) as error:
         return None, error
@@ -189,48 +170,6 @@ def _children_ignore_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
-    """Yield arguments for parallel_config while the block lasts: none for this machine."""
-    if address is None:
-        yield {}
-        return
-    try:
-        from dask.distributed import Client
-        from distributed.comm import get_address_host_port
-    except ImportError as error:
-        raise InputError(
-            "--dask: needs dask.distributed, which is not installed; pip install distributed."
-        ) from error
-    try:
-        # Raises ValueError as Client does, which would not end well; TypeError: no certificates.
-        get_address_host_port(address)
-        client = Client(address, timeout=CONNECT_LIMIT, set_as_default=False)
-    except (OSError, TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"--dask: no scheduler answers at {address} ({reason}); start one, or correct it."
-        ) from error
-    _say_whom_it_trusts(client.scheduler.address)
-    with client:
-        yield {"backend": "dask", "client": client}
-
-
-@cache  # once
-def _say_whom_it_trusts(address: str) -> None:
-    """Warn that a connection is not encrypted.
-
-    Dask sends pickles, which run code where they are read.
-    """
-    if not address.startswith(("tls://", "wss://")):
-        print(
-            f"--dask: {address} is not encrypted: whoever reaches it, or can change what is "
-            "sent, runs code here and on its workers; use "
-            "tls:// with certificates, or a network of your own",
-            file=sys.stderr,
-        )
 
 
 def whole_number(text: str) -> int:

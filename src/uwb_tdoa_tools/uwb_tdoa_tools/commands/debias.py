@@ -93,13 +93,11 @@ def _fit(args: Namespace) -> int:
     estimator = debiasing.PositionEstimator(
         options.reading_of(args), *options.filter_of(args), args.align
     )
-    recordings, held = (
-        estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout)
-    )
+    recordings, held = (estimator.reading.find(paths) for paths in (args.flights, args.holdout))
     options.check_holdout(
         (path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held)
     )
-    fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
+    fitted = list(parallel.over(estimator, recordings, args.jobs))
     shrinkage = debiasing.cross_validated(fitted, args.static, estimator, args.step)
     made = debiasing.fit_map(fitted, args.static, estimator, args.step)
     made = made.scaled(shrinkage.share) if shrinkage else made
@@ -119,7 +117,7 @@ def _fit(args: Namespace) -> int:
     if shrinkage and not shrinkage.gains.mean() >= debiasing.SMALLEST_GAIN:
         refusals.append(debiasing.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
-        flown = parallel.over(estimator, held, args.jobs, args.dask)
+        flown = parallel.over(estimator, held, args.jobs)
         figures["held out"] = debiasing.comparison_rows(flown, made, estimator.effects)
         debiasing.print_rows("held out", figures["held out"])
         gained = debiasing.mean_gain(figures["held out"])
@@ -144,8 +142,8 @@ def _judge(args: Namespace) -> int:
         options.reading_of(args), *options.filter_of(args), args.align
     )
     made = BiasMap.load(args.map)
-    found = estimator.reading.find(args.flights, bool(args.dask))
-    flown = parallel.over(estimator, found, args.jobs, args.dask)
+    found = estimator.reading.find(args.flights)
+    flown = parallel.over(estimator, found, args.jobs)
     rows = debiasing.comparison_rows(flown, made, estimator.effects)
     debiasing.print_rows("flight", rows)
     gained = debiasing.mean_gain(rows)

@@ -158,9 +158,9 @@ def _diagnose(args: Namespace) -> int:
     ):
         return 1
     found = reading.find(args.flights)
-    jobs, dask, over = parallel.workers_for(args, len(found))
+    jobs, over = parallel.workers_for(args, len(found))
     flights, holdout = (
-        reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
+        reading.flights(paths, args.most, jobs) for paths in (args.flights, args.holdout)
     )
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):

@@ -37,7 +37,6 @@ def parser() -> ArgumentParser:
         "evaluate flight_bag --odometry tags_bag --topic odometry=/tag1/odometry",
         "evaluate flights/ --survey surveys/ -p adapt_noise:=false -p loss:=huber",
         "evaluate flights/ --survey surveys/ --without height --without pressure",
-        "evaluate flights/ --survey surveys/ --dask tcp://10.0.0.1:8786",
         options=[
             *options.recordings(),
             *options.ESTIMATOR,
@@ -81,7 +80,7 @@ def _evaluate(args: Namespace) -> int:
     estimator = options.estimator_of(args)
     reading = options.reading_of(args)
     found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(
-        args.flights, bool(args.dask)
+        args.flights
     )
     for name in ("odometry", "plot"):
         if getattr(args, name) and len(found) != 1:
@@ -92,7 +91,7 @@ def _evaluate(args: Namespace) -> int:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(evaluating.head_line())
     kept, pool = [], Pool()
-    for result in parallel.over(evaluator, found, args.jobs, args.dask):
+    for result in parallel.over(evaluator, found, args.jobs):
         pool.add(result)
         # else nothing grows with the number of flights
         kept += [result] if args.json else []

@@ -44,7 +44,7 @@ def parser() -> argparse.ArgumentParser:
         "fly --vehicle rover --flights 20 --plot driven.png",
         "fly --silence circle:3 --effects effects.yaml",
         "fly --installation 7 --flights 3 --seed 101 --record flown/",
-        "fly --flights 1000 --json flown.json --dask tcp://10.0.0.1:8786",
+        "fly --flights 1000 --json flown.json --jobs 4",
         options=[
             option(
                 "--flights",
@@ -203,7 +203,7 @@ def _fly(args: argparse.Namespace) -> int:
         for seed in seeds
     ]
     one = partial(verdict.fly_task, args.record, args.plot is not None)
-    verdicts, pictures = zip(*parallel.over(one, tasks, args.jobs, args.dask))
+    verdicts, pictures = zip(*parallel.over(one, tasks, args.jobs))
     summed = summary(verdicts)
     cli.show(text(summed))
     cli.write_json(args.json, {"summary": summed, "flights": verdicts})

@@ -72,15 +72,15 @@ def _localize(args: Namespace) -> int:
     named = areas.read_areas(args.areas) if args.areas else {}
     estimator = options.estimator_of(args)
     reading = options.reading_of(args, truth=False)
-    found = reading.find(args.flights, bool(args.dask))
+    found = reading.find(args.flights)
     check_names(found)
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
-    folder, located = out.absolute() if args.dask else out, []
+    located = []
     localizer = Localizer(
-        reading, estimator, folder, args.bag, args.residuals, args.zones, args.effects, named
+        reading, estimator, out, args.bag, args.residuals, args.zones, args.effects, named
     )
-    for one in parallel.over(localizer, found, args.jobs, args.dask):
+    for one in parallel.over(localizer, found, args.jobs):
         located.append(one)
         first, *others = one.assessment.sentences()
         others += areas.sentences(one.stays)

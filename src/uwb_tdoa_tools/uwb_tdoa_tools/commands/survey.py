@@ -79,8 +79,8 @@ def _survey(args: Namespace) -> int:
         max(tape.std, tape.height_std or 0.0),
     ):
         return 1
-    jobs, dask, over = parallel.workers_for(args, len(reading.find(args.flights)))
-    flights = reading.flights(args.flights, None, jobs, dask)
+    jobs, over = parallel.workers_for(args, len(reading.find(args.flights)))
+    flights = reading.flights(args.flights, None, jobs)
     remarks = remark_on_surveys([its for _, its in reading.find(args.flights)], flights)
     cli.say("survey", *remarks, *judge.remarks(flights[0].anchors))
     known = options.known_of(args, flights)

@@ -67,10 +67,10 @@ def _train(args: Namespace) -> None:
 
     reading = options.reading_of(args)
     # As many for folds as for flights: with another number, joblib restarts all processes.
-    jobs, dask, over = parallel.workers_for(args, len(reading.find(args.flights)), 2)
-    several = reading.flights(args.flights, args.most, jobs, dask)
+    jobs, over = parallel.workers_for(args, len(reading.find(args.flights)), 2)
+    several = reading.flights(args.flights, args.most, jobs)
     inputs.require_tdoas(several, "train")
-    aligned = parallel.over(partial(with_aligned_truth, align=args.align), several, jobs, dask)
+    aligned = parallel.over(partial(with_aligned_truth, align=args.align), several, jobs)
     flights = {flight.name: flight for flight in aligned}
     names = models.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):

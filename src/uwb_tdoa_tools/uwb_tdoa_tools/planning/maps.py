@@ -366,15 +366,15 @@ class Hall:
         """Return the rows of the anchors that are heard at points (n, 3) m: list of (k,) arrays."""
         return heard_at(points, self.anchors.positions, self.reach, self.walls)
 
-    def chart(self, grid: Grid, jobs: int | None = None, dask: str | None = None) -> Chart:
-        """Return the Chart of a Grid. jobs, dask : as for `parallel.over`."""
+    def chart(self, grid: Grid, jobs: int | None = None) -> Chart:
+        """Return the Chart of a Grid. jobs : as for `parallel.over`."""
         points = grid.points
         tiles = self._tiles(points)
         unit = "part of the hall" if len(tiles) > 1 else "map"
         parts = [points[cells] for cells in tiles]
         whole = unheard(points, self.installation.dimensions)
         heard = np.zeros(len(points), int)
-        results = parallel.over(self.judge, parts, jobs, dask, unit)
+        results = parallel.over(self.judge, parts, jobs, unit)
         for cells, (found, counts) in zip(tiles, results):
             whole.assign(cells, found)
             heard[cells] = counts

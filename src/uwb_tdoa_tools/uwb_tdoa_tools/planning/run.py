@@ -51,7 +51,7 @@ def plan(args: Namespace) -> bool:
     demand = Demand(room, args.accuracy, args.flyable)
     grid = grid_of(args, room)
     reading = Reading(args.anchors)
-    recordings = reading.find(args.flights or [], bool(args.dask))
+    recordings = reading.find(args.flights or [])
     walls = None if args.walls is None else Walls.from_yaml(args.walls)
     aim = aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
     whole = Hall(installation, demand, reach, walls)
@@ -64,7 +64,7 @@ def plan(args: Namespace) -> bool:
     if anchors is None:
         whole, found, figures["design"] = designed(args, whole, grid)
     else:
-        found = whole.chart(grid, args.jobs, args.dask)
+        found = whole.chart(grid, args.jobs)
     installation = whole.installation
     about = report.summary(found)
     figures |= {"anchors": len(whole.anchors), "map": about}
@@ -83,7 +83,7 @@ def plan(args: Namespace) -> bool:
     draw_map(whole, found, args.out)
     if recordings:
         read = partial(flight_errors, reading, tuple(args.sensors))
-        flown = parallel.over(read, recordings, args.jobs, args.dask)
+        flown = parallel.over(read, recordings, args.jobs)
         step = args.step or 0.4
         figures["flights"] = evaluate_flights(flown, installation, room, step, args.out)
         report.print_flights(figures["flights"])
@@ -256,7 +256,7 @@ def designed(args: Namespace, whole: Hall, grid: Grid) -> tuple[Hall, Chart, lis
     with cli.Progress("plan") as progress:
         layouts, steps = design(whole, grid.points, args.share, progress)
     for anchors in layouts:
-        found = whole.with_anchors(anchors).chart(grid, args.jobs, args.dask)
+        found = whole.with_anchors(anchors).chart(grid, args.jobs)
         if found.flyable.mean() >= args.share:
             break
     chosen = step_of(found, anchors, whole.demand.room)

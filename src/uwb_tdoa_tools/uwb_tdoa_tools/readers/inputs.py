@@ -30,17 +30,11 @@ Recording = tuple[Path, str | Path | None]  # and its survey
 _REPORTED: set[str | Path | None] = set()  # surveys whose use for bags was printed
 
 
-def find_flights(
-    paths: Iterable[str | Path], survey: str | Path | None = None, absolute: bool = False
-) -> list[Recording]:
+def find_flights(paths: Iterable[str | Path], survey: str | Path | None = None) -> list[Recording]:
     """Return pairs (recording, survey or None), sorted within each folder.
 
     A given survey replaces the anchors in a bag, with a message. From a folder of surveys, the bag
     takes the fitting file, or keeps its own anchors.
-
-    Parameters
-    ----------
-    absolute : return absolute paths, for processes with another working directory.
 
     Raises InputError if a path has no recording, or if no survey fits.
     """
@@ -54,10 +48,7 @@ def find_flights(
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
-    pairs = [(path, _survey_of(path, survey)) for path in found]
-    return (
-        [(path.absolute(), of and Path(of).absolute()) for path, of in pairs] if absolute else pairs
-    )
+    return [(path, _survey_of(path, survey)) for path in found]
 
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
@@ -145,15 +136,14 @@ class Reading:
     profile: Profile | None = None
     tag: str = ""
 
-    def find(self, paths: Iterable[str | Path], absolute: bool = False) -> list[Recording]:
+    def find(self, paths: Iterable[str | Path]) -> list[Recording]:
         """Return pairs (recording, survey or None), see `find_flights`; empty without paths.
 
         Raises InputError if topics are given but no recording is a bag.
         """
         if self.profile:
-            places = [Path(path).absolute() if absolute else Path(path) for path in paths]
-            return [(path, survey_for(path, self.survey)) for path in places]
-        found = find_flights(paths, self.survey, absolute)
+            return [(path, survey_for(path, self.survey)) for path in map(Path, paths)]
+        found = find_flights(paths, self.survey)
         if found and not any(is_bag(path) for path, _ in found):
             self._refuse_topics(found[0][0])
         return found
@@ -220,7 +210,6 @@ class Reading:
         paths: Iterable[str | Path],
         most: int | None = None,
         jobs: int | None = 1,
-        dask: str | None = None,
     ) -> list[Flight]:
         """Read the Flights of recordings and folders, with a progress bar.
 
@@ -228,9 +217,9 @@ class Reading:
         ----------
         most : largest total number of TDOAs and ranges, except for the first flight. Above it,
             whole flights are drawn at random, with a fixed seed. This bounds memory and time.
-        jobs, dask : see `parallel.over`.
+        jobs : see `parallel.over`.
         """
-        found, count = self.find(paths, bool(dask)), 0
+        found, count = self.find(paths), 0
         read: dict[int, Flight] = {}
         order = (
             range(len(found))
@@ -238,7 +227,7 @@ class Reading:
             else np.random.default_rng(0).permutation(len(found)).tolist()
         )
         for flight, number in zip(
-            parallel.over(self.read, [found[number] for number in order], jobs, dask), order
+            parallel.over(self.read, [found[number] for number in order], jobs), order
         ):
             count += len(flight.tdoa) + sum(len(getattr(flight, name) or ()) for name in LOCATING)
             if most is not None and read and count > most:
