@@ -239,6 +239,28 @@ def test_refused_noise_that_makes_deviations_honest_is_named(nees, better):
 
 
 @pytest.mark.slow
+def test_of_what_flights_explain_alike_the_mean_is_applied():
+    """On a circle along the track, x follows the yaw. In the third flight it does not."""
+    heading = SmoothTerm(
+        {"4.c1": 0.3}, covariate="yaw", form="anchor", knots=(-np.pi, np.pi), shape="wave"
+    )
+    *fitted, third = (heading.inject(sparse_flight(seed, 40.0)) for seed in (104, 114, 109))
+    found = diagnose(fitted)
+    alike = {effect.arguments for effect in found.effects if isinstance(effect, SmoothTerm)}
+    assert {("x",), ("yaw",)} <= alike
+    error, corrected = (
+        comparison.score(case, comparison.run_of(None, case)).rmse_3d
+        for case in (
+            comparison.ValidationCase(third, effects) for effects in (EffectSet(), found.effects)
+        )
+    )
+    low, high = found.after["pooled"]["rmse_3d_gain_elsewhere"]
+    assert corrected < error
+    assert low < 1.0 - corrected / error < high
+    assert "their mean is applied" in str(verdict(found))
+
+
+@pytest.mark.slow
 def test_two_processes_give_the_same_to_the_bit():
     flights = [
         effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 18.0))

@@ -15,7 +15,13 @@ from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.commands import diagnose
 from uwb_tdoa_tools.commands.simulate import OPTIONS, POSE, config_of
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.motions import ANCHOR_CLEARANCE, RATE, Limits, motions, route
+from uwb_tdoa_tools.diagnosis.motions import (
+    ANCHOR_CLEARANCE,
+    RATE,
+    Limits,
+    _line,
+    motions,
+)
 from uwb_tdoa_tools.diagnosis.next_flight import Model, Rivalry, plan_flight
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report import maps
@@ -90,8 +96,8 @@ def test_a_room_too_small_or_a_flight_too_short_is_refused():
 
 def test_a_path_goes_on_where_the_one_before_ended():
     limits = Limits()
-    turning = route(np.zeros((2, 3)), [0.0, 2.0 * np.pi], limits)
-    other = route(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), [0.0, 0.5], limits)
+    turning = _line(np.zeros(3), np.zeros(3), (0.0, 2.0 * np.pi), limits, "turn")
+    other = _line(np.zeros(3), np.array([1.0, 0.0, 0.0]), (0.0, 0.5), limits, "line")
     path = turning.then(other)
     keeps(path, limits)
     assert path.duration == pytest.approx(turning.duration + other.duration)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_ekf.evidence import MOVED, POSITION, Part, eliminated, with_each_change
 from uwb_tdoa_tools.diagnosis import deviations
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
@@ -27,7 +27,7 @@ from uwb_tdoa_tools.diagnosis.regression.confounding import (
 from uwb_tdoa_tools.diagnosis.regression.fit import APPLIED_STD, fit, refit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
 from uwb_tdoa_tools.diagnosis.regression.scorer import Scorer
-from uwb_tdoa_tools.diagnosis.regression.select import rank, select
+from uwb_tdoa_tools.diagnosis.regression.select import SAME, Rival, rank, select
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of, columns_of
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, posterior, solve
@@ -210,6 +210,35 @@ def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
     np.testing.assert_allclose(kept.fit.beta, half.beta, rtol=1e-6)
     assert (np.diag(kept.fit.cov) >= np.diag(half.cov) * (1.0 - 1e-6)).all()
     assert np.abs(spoilt.only([delay]).fit.beta - half.beta).max() > 1e-4
+
+
+def over(covariate):
+    term = SmoothTerm(covariate=covariate, form="anchor", knots=(-2.0, 2.0), shape="line")
+    return Candidate((Term(term, term.keys_of(("4",))),))
+
+
+def test_of_functions_that_explain_alike_the_mean_is_kept(late):
+    table, candidates = late
+    delay, one, same, worse = named(candidates, "anchor_delay"), *map(over, ("x", "y", "height"))
+    table = table.with_terms([each.terms[0] for each in (one, same, worse)])
+    selection = select(table, [delay], fit(table, columns_of(candidates)).inflation).plus(one)
+    told = replace(
+        selection, rivals=((), (Rival(1.0, same, 0.5 * SAME), Rival(9.0, worse, 2.0 * SAME)))
+    )
+    for share, rows in ((None, None), (0.7, table.block % 2 == 0)):
+        kept = selection.beside(told).kept([delay, one], share, rows).fit
+        several = [
+            refit(table, columns_of([delay, each]), selection.fit, rows, share)
+            for each in (one, same)
+        ]
+        residual = 0.5 * (several[0].residual + several[1].residual)
+        np.testing.assert_allclose(kept.residual, residual, atol=1e-9)
+        left = table.y - table.matrix(kept.columns) @ kept.beta
+        np.testing.assert_allclose(kept.residual, left, atol=1e-9)
+        np.testing.assert_allclose(kept.values(same.columns), 0.5 * several[1].values(same.columns))
+    effects = effects_of(selection.beside(told).kept([delay, one]))
+    assert [effect.arguments for effect in effects[1:]] == [("x",), ("y",)]
+    assert len(effects_of(selection.kept([delay, one]))) == 2
 
 
 def test_what_is_set_apart_stays_in_the_fit_of_the_others(late):

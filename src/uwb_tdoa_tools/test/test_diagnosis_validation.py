@@ -296,6 +296,15 @@ def test_before_and_after_with_intervals(flights):
     assert 0.4 < low < high < 1.0
     wider = after["pooled"]["rmse_3d_gain_elsewhere"]
     assert wider[0] < low and high < wider[1] < 1.0
+    cases = [ValidationCase(flight, told, untold=0.01) for flight in flights]
+    untold = compare(cases, Baseline(NONE))[1]
+    worst = np.mean(
+        [np.log(np.hypot(row["rmse_3d"], 0.1) / row["rmse_3d"]) for row in after["runs"]]
+    )
+    expected = 1.0 - (1.0 - wider[0]) * np.exp(worst)
+    elsewhere = untold["pooled"]["rmse_3d_gain_elsewhere"]
+    assert elsewhere == pytest.approx([expected, wider[1]])
+    assert untold["runs"][0]["rmse_3d_elsewhere"] > untold["runs"][0]["rmse_3d"]
     assert [row["flight"] for row in after["runs"]] == [flight.name for flight in flights]
     for side in (before, after):
         for row in side["runs"]:

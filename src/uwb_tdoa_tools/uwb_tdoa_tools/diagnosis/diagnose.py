@@ -353,6 +353,8 @@ def _by_error(
     cases, judged_on = validation.validation_cases(
         model, fitted, held_out, base, effects, selected.share
     )
+    if not held_out:
+        cases = [replace(case, untold=selected.untold(attribution)) for case in cases]
     judged = partial(
         comparison.compare,
         baseline=baseline,

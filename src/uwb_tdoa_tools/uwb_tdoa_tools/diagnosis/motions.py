@@ -83,14 +83,6 @@ class Library(NamedTuple):
     limits: Limits
 
 
-def route(places: np.ndarray, yaw: Sequence[float], limits: Limits) -> TimedPath:
-    """Return the TimedPath from place to place, (n, 3) m, with a yaw (n,), rad, at each."""
-    out = TimedPath(places[:1], np.array(yaw[:1]), "start", (0,))
-    for place, angle in zip(places[1:], yaw[1:]):
-        out = out.then(_line(out.p[-1], place, (out.yaw[-1], angle), limits, "line"))
-    return out
-
-
 def motions(room: Room, flights: Sequence[Flight], limits: Limits) -> Library:
     """Return the Library of motions in a Room: lines, circles, turns, and passes at anchors.
 

@@ -42,7 +42,7 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     effects: dict[Hashable, Effect] = {}
     error = np.sqrt(np.diag(selection.fit.cov))
     fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), error.tolist())))
-    for term in (term for candidate in selection.chosen for term in candidate.terms):
+    for term in selection.terms:
         effect = term.effect
         identity = entry_of(effect)
         effects.setdefault(identity, effect)

@@ -80,11 +80,25 @@ class ValidatedSelection:
     misleading: frozenset[str] = frozenset()
     poses: Sequence[FixedPoses | None] = (None,)
 
+    def untold(self, attribution: Attribution) -> float:
+        """Return the power of the error, m^2, that another flight may keep.
+
+        Of n functions that explain these flights alike, the cause is one, and 1 / n of it is applied.
+        If the functions are independent in another flight, their mean leaves 1 - 1 / n of its power.
+        """
+        selection, total = self.selection.beside(attribution.selection), 0.0
+        for one, rivals in zip(selection.chosen, selection.rivals):
+            count = 1 + sum(rival.is_alike for rival in rivals)
+            power = (self.error + self.worth.get(one, 0.0)) ** 2 - self.error**2
+            total += (1.0 - 1.0 / count) * max(power, 0.0)
+        return total
+
     def applied(self, attribution: Attribution) -> Attribution:
         """Return the Attribution with the selected effects only."""
+        selection = self.selection.beside(attribution.selection)
         return replace(
             attribution,
-            selection=with_deviations(self.selection),
+            selection=with_deviations(selection.kept(selection.chosen, self.share)),
             detections=self.detections,
             alone=(),
         )
@@ -107,7 +121,8 @@ def cross_fitted(
     most : largest number of cases, evenly taken; None for all
     share : as of `refit`
     """
-    table, selection = attribution.selection.table, attribution.selection
+    selection = attribution.selection
+    table = selection.table
     if len(flights) > 1:
         parts = [
             (ValidationCase(flights[k], base), k, table.flight != k) for k in range(len(flights))
@@ -130,13 +145,9 @@ def cross_fitted(
             for k in range(2)
         ]
         parts = [(half, 0, number % 2 != k) for k, half in enumerate(halves)]
-    out, columns = [], selection.columns(candidates)
+    out = []
     for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
-        others = replace(
-            selection,
-            chosen=tuple(candidates),
-            fit=refit(table, columns, selection.fit, rows, share),
-        )
+        others = selection.kept(candidates, share, rows)
         found = usable([*effects_of(others), *(detection.effect for detection in detections)])
         fitted = [other for other in range(len(flights)) if other != k] or [k]
         out.append(

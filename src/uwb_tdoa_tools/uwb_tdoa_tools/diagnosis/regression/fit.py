@@ -191,6 +191,21 @@ def refit(
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
+def mean_of(fits: Sequence[Fit], weights: Sequence[float]) -> Fit:
+    """Return the weighted sum of Fits of one RegressionTable; a Column that one lacks counts as 0.
+
+    weights : of sum 1. The covariance is at least that of this sum.
+    """
+    columns = list(dict.fromkeys(column for one in fits for column in one.columns))
+    beta, cov = np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
+    for one, weight in zip(fits, weights):
+        at = [columns.index(column) for column in one.columns]
+        beta[at] += weight * one.beta
+        cov[np.ix_(at, at)] += abs(weight) * one.cov
+    residual = np.tensordot(weights, [one.residual for one in fits], axes=1)
+    return replace(fits[0], columns=tuple(columns), beta=beta, cov=cov, residual=residual)
+
+
 def _scales(table: RegressionTable, residual: np.ndarray) -> np.ndarray:
     """Return the scale of Student's t per group by the fixed point of its likelihood, (groups,)."""
     out = np.ones(AXES * len(table.channels))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,11 +20,11 @@ import numpy as np
 from uwb_tdoa_bias.effects import Effect
 
 from ..channels import CHANNELS
-from .fit import Fit, fit, refit
+from .fit import Fit, fit, mean_of, refit
 from .scan import Scan
 from .scorer import Scorer
 from .table import RegressionTable
-from .terms import Candidate, Column, columns_of
+from .terms import Candidate, Column, Term, columns_of
 
 MAX_STEPS = 14  # largest number of forward steps
 FITTED = 9  # proposals of a scan that separate fits score
@@ -33,6 +34,8 @@ LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate
 AMBIGUOUS = 10.0  # smallest gap of the criterion that decides between two candidates
 # largest relative gap of the criterion of a rival function
 ALIKE = 0.1
+# the same of functions that the flights do not tell apart: a simple function is never exact
+SAME, IDENTICAL = 0.05, 1e-9
 
 
 class Search(Protocol):
@@ -50,10 +53,20 @@ class Rival:
     """A Candidate that can replace a chosen one.
 
     gap : by how much its criterion is worse, twice a log-likelihood
+    lacks : the same, as a share of the criterion of the chosen one
     """
 
     gap: float
     candidate: Candidate
+    lacks: float
+
+    @property
+    def is_alike(self) -> bool:
+        """Return whether it is a function that nodes can correct, and that explains as much."""
+        one = self.candidate
+        usable = all(term.effect.usable for term in one.terms)
+        # With no gap at all it is the same function by another name.
+        return IDENTICAL < abs(self.lacks) and self.lacks <= SAME and usable and not one.declared
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,16 +101,45 @@ class Selection:
         columns = self.columns(chosen["chosen"])
         return replace(self, **chosen, fit=fit(self.table, columns, self.fit.inflation))
 
-    def kept(self, candidates: Collection[Candidate], share: float | None = None) -> Selection:
+    def kept(
+        self,
+        candidates: Collection[Candidate],
+        share: float | None = None,
+        rows: np.ndarray | None = None,
+    ) -> Selection:
         """Return the Selection of some of the chosen Candidates, with the present weights.
 
-        With these weights, contributions of the dropped candidates do not count as outliers.
+        With these weights, contributions of the dropped candidates do not count as outliers. The
+        flights do not tell a function from those that explain as much, but other flights may. So the
+        mean of these functions is kept, each fitted in its place.
 
-        share : as of `refit`
+        share, rows : as of `refit`
         """
         chosen = self._chosen_of(candidates)
         columns = self.columns(chosen["chosen"])
-        return replace(self, **chosen, fit=refit(self.table, columns, self.fit, share=share))
+        fits, weights = [refit(self.table, columns, self.fit, rows, share)], [1.0]
+        for one, alike in zip(chosen["chosen"], map(_alike, chosen["rivals"])):
+            rest = [column for column in columns if column not in one.columns]
+            for other in alike:
+                fits.append(refit(self.table, [*rest, *other.columns], self.fit, rows, share))
+                weights.append(1.0 / (1 + len(alike)))
+                weights[0] -= weights[-1]
+        return replace(self, **chosen, fit=mean_of(fits, weights))
+
+    def beside(self, other: Selection) -> Selection:
+        """Return the Selection with the rivals that another one has for the same Candidates."""
+        known = dict(zip(other.chosen, other.rivals))
+        rivals = tuple(known.get(one, ()) for one in self.chosen)
+        terms = [term for one in chain.from_iterable(rivals) for term in one.candidate.terms]
+        return replace(self, rivals=rivals, table=self.table.with_terms(terms))
+
+    @property
+    def terms(self) -> list[Term]:
+        """Return the Terms whose values the Fit has: those of functions that explain as much, too."""
+        alike = chain.from_iterable(map(_alike, self.rivals))
+        fitted = set(self.fit.columns)
+        several = [*self.chosen, *(one for one in alike if fitted.issuperset(one.columns))]
+        return [term for candidate in several for term in candidate.terms]
 
     def where(self, keeps: Callable[[Effect], bool]) -> Selection:
         """Return the Selection of terms whose Effects `keeps` accepts, with the present weights.
@@ -129,6 +171,10 @@ class Selection:
         return replace(
             self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ())
         )
+
+
+def _alike(rivals: Sequence[Rival]) -> list[Candidate]:
+    return [rival.candidate for rival in rivals if rival.is_alike]
 
 
 def select(
@@ -372,7 +418,8 @@ def with_rivals(
                 and score > least
                 and set(other.channels) & set(candidate.channels)
             ):
-                near.setdefault(other.title, Rival(float(own - score), other))
+                gap = float(own - score)
+                near.setdefault(other.title, Rival(gap, other, gap / max(own, AMBIGUOUS)))
         out.append(tuple(near.values()))
         progress()
     return replace(selection, rivals=tuple(out))

@@ -434,6 +434,11 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
         )
     if elsewhere := diagnosis.after["pooled"].get("rmse_3d_gain_elsewhere"):
         out.append(f"The 95 % interval of the gain of another flight is {percent(elsewhere)}.")
+    if any(case.untold > 0.0 for case in diagnosis.cases):
+        out.append(
+            "Several functions explain these flights alike, and their mean is applied. A flight on "
+            "which they differ tells which one is the cause."
+        )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     return out
