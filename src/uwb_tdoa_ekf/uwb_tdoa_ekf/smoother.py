@@ -288,7 +288,7 @@ def _backward(
     rows : (n,) array of ODOMETRY
         Filled from its end.
     """
-    count = 0
+    count, scratch = 0, np.empty(ERROR_STATES)
     for i in range(len(records) - 1, -1, -1):
         record = records[i]
         earlier = records[i - 1].t if i > 0 else before
@@ -299,7 +299,7 @@ def _backward(
             adjoint[:] = 0.0
             information[:, :] = 0.0
         else:
-            _through_update(record, adjoint, information)
+            horizon.through_update(record, adjoint, information, True, scratch)
             _through_prediction(record.transition, adjoint, information)
     return count
 
@@ -314,27 +314,6 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
     inject(row.x, -np.dot(P, adjoint), 1.0)
     covariance = P - np.dot(np.dot(P, information), P)
     row.covariance[:] = 0.5 * (covariance + covariance.T)[:9, :9]
-
-
-@compiled
-def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """Step `adjoint` and `information` backwards through one scalar update.
-
-    The equations are lambda <- C' lambda - h' y / S and Lambda <- C' Lambda C + h' h / S with C = I -
-    K h. In the code:
-
-    - lambda, Lambda: adjoint, information
-    - h, K: record.jacobian, record.gain
-    - y, S: record.innovation and its record.variance
-    """
-    h, gain = record.jacobian, record.gain
-    information_gain = np.dot(information, gain)  # Lambda K
-    # factors of h' and of h' h: K' lambda + y / S, and K' Lambda K + 1 / S
-    adjoint_factor = record.innovation / record.variance + np.dot(gain, adjoint)
-    information_factor = 1.0 / record.variance + np.dot(gain, information_gain)
-    cross = np.outer(h, information_gain)
-    adjoint -= adjoint_factor * h
-    information += information_factor * np.outer(h, h) - cross - cross.T
 
 
 @compiled

@@ -51,7 +51,6 @@ from .memory import (
     N_YAWS,
     ODOMETRY,
     OFF,
-    REJECTED,
     REPEATED,
     RESIDUAL,
     STARTUP,
@@ -59,6 +58,7 @@ from .memory import (
     FilterState,
     Measurements,
     Output,
+    fill_residual,
 )
 from .startup import INLIER
 from .state import CONSTRAINT_PERIOD, coast, predict, turn_about_vertical
@@ -229,7 +229,7 @@ def _on_tdoa(
     residual: Record,
     records: np.ndarray,
 ) -> None:
-    _fill(residual, np.nan, np.nan, 0.0, STARTUP)
+    _wait(residual)
     delay = _subtract_delays(tdoa, anchors)
     if initialization.is_repeat(ekf, tdoa):
         residual.verdict = REPEATED
@@ -388,7 +388,7 @@ def _on_sensor(
     residual: Record,
     records: np.ndarray,
 ) -> None:
-    _fill(residual, np.nan, np.nan, 0.0, STARTUP)
+    _wait(residual)
     if sensor.kind == sensors.RANGE:
         _on_range(ekf, anchors, parameters, sensor, residual, records)
     elif ekf.running and _predict(ekf, parameters, sensor.t, records):
@@ -550,7 +550,7 @@ def _update(
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)
         if in_time < ground.NOT_USED:
-            _reject(residual, innovation)
+            fill_residual(residual, innovation, 0.0)
             return True
         innovation.noise_variance /= in_time
     if tdoa.t < ekf.rival_until:
@@ -558,7 +558,7 @@ def _update(
         # weights, many such TDOAs would pull the position.
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         if abs(innovation.value) > INLIER:
-            _reject(residual, innovation)
+            fill_residual(residual, innovation, 0.0)
             return False
     inflation = noise.variance_inflation(ekf, parameters)
     for h in range(HYPOTHESES):
@@ -583,19 +583,10 @@ def _update(
 
 
 @compiled
-def _fill(
-    residual: Record, innovation: float, variance: float, weight: float, verdict: int
-) -> None:
-    """Fill in a RESIDUAL."""
-    residual.innovation, residual.variance = innovation, variance
-    residual.weight, residual.verdict = weight, verdict
-
-
-@compiled
-def _reject(residual: Record, innovation: Record) -> None:
-    """Fill in the RESIDUAL of a rejected INNOVATION."""
-    variance = innovation.prior_variance + innovation.noise_variance
-    _fill(residual, innovation.value, variance, 0.0, REJECTED)
+def _wait(residual: Record) -> None:
+    """Fill in the RESIDUAL of a measurement that waits for the start of the filter."""
+    residual.innovation = residual.variance = np.nan
+    residual.weight, residual.verdict = 0.0, STARTUP
 
 
 @compiled
@@ -693,9 +684,8 @@ def _update_hypothesis(
     if h == ekf.best:
         if ekf.yaw_test.alone:
             yaw_check.observe(ekf, correlation_length, of_tdoa)
-        _reject(residual, innovation)
+        fill_residual(residual, innovation, innovation.weight)
         if innovation.weight > 0.0:
-            residual.weight, residual.verdict = innovation.weight, USED
             history.add_update(ekf, h, t, records)
             if of_tdoa and parameters.adapt_noise and not ekf.sensed:
                 noise.learn_motion(ekf, parameters, t, innovation)

@@ -250,8 +250,7 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
                     known += 1
             pair.change, pair.apart = second - first, stamps[1] / m1 - stamps[0] / m0
             pair.change_variance = 1.57 * (1.0 / m0 + 1.0 / m1)
-        for j in range(m1):
-            values[0, m0 + j] = values[1, j]
+        values[0, m0 : m0 + m1] = values[1, :m1]
         pair.value = np.median(values[0, : m0 + m1])
         count += 1
     spread = 1.48 * np.median(deviations[:known]) if known else np.inf

@@ -23,7 +23,7 @@ from . import yaw_check
 from .history import add_reset, add_update
 from .hypotheses import add_log_likelihood, alive
 from .inertial import UPRIGHT
-from .memory import N_YAWS, REJECTED, USED
+from .memory import N_YAWS, USED, fill_residual
 from .state import rotation
 from .update import kalman_robust, project
 from .workspace import STD
@@ -71,7 +71,6 @@ def observe(
     # before `record` sets `heard`
     share = min(max(sensor.t - height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0)
     record(ekf, sensor)
-    residual.weight, residual.verdict = 0.0, REJECTED
     innovation, distance = ekf.innovation, sensor.value[0] + parameters.height_arm
     up = compare(
         ekf.hypotheses[ekf.best],
@@ -81,8 +80,7 @@ def observe(
         ekf.transition.rotation,
         innovation,
     )
-    residual.innovation = innovation.value
-    residual.variance = innovation.prior_variance + innovation.noise_variance
+    fill_residual(residual, innovation, 0.0)
     z = _plausible_z(ekf, parameters, up)
     if math.isnan(z):
         return

@@ -69,8 +69,7 @@ def add_update(ekf: Record, h: int, t: float, history: np.ndarray) -> None:
         record.innovation, record.variance = innovation.value, innovation.total_variance
         for n in range(innovation.entries):
             record.jacobian[innovation.states[n]] = innovation.row[n]
-        for j in range(ERROR_STATES):
-            record.gain[j] = innovation.cross_covariance[j] / innovation.total_variance
+        record.gain[:] = innovation.cross_covariance / innovation.total_variance
 
 
 @compiled

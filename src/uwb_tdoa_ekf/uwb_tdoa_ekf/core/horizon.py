@@ -28,9 +28,9 @@ from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.common.robust_loss import CAUCHY, HUBER, weight
 
 from . import hypotheses
-from .ground import SPEED
 from .initialization import last_few, recent
-from .memory import HYPOTHESES, LINEARIZATION, MODEL, MODELS, ODOMETRY, OFF, ROOM, RUNNING, STEP
+from .memory import LINEARIZATION, MODEL, MODELS, ODOMETRY, OFF, ROOM, RUNNING, STEP
+from .startup import anywhere
 from .workspace import prior_of
 
 # Each model: random acceleration as a share of motion_noise, from a racing drone to a tag at rest, and
@@ -160,15 +160,6 @@ def _begin_anew(ekf: Record, parameters: Record, bounds: np.ndarray) -> None:
             place = horizon.models[m].at[k]
             place.weight = 1.0
             place.p[:] = ekf.hypotheses[ekf.best].x[:3]
-
-
-@compiled
-def anywhere(workspace: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Fill in the state x (6,) and covariance (6, 6) of a tag anywhere in its workspace (2, 3), m."""
-    for k in range(3):
-        x[k] = 0.5 * (workspace[0, k] + workspace[1, k])
-        covariance[k, k] = (0.5 * (workspace[1, k] - workspace[0, k])) ** 2
-        covariance[3 + k, 3 + k] = SPEED**2
 
 
 @compiled
@@ -338,7 +329,7 @@ def _backward(steps: np.ndarray, at: np.ndarray, rows: np.ndarray) -> tuple[floa
     whole = len(rows) > 0
     for i in range(len(steps) - 1, -1, -1):
         one = steps[i]
-        factor, of_information = _through_update(one.tdoa, adjoint, information, whole, scratch)
+        factor, of_information = through_update(one.tdoa, adjoint, information, whole, scratch)
         for k in range(3):
             p = one.x[k]
             for j in range(6):
@@ -355,7 +346,7 @@ def _backward(steps: np.ndarray, at: np.ndarray, rows: np.ndarray) -> tuple[floa
                     rows[i].covariance[j, k] = one.P[j, k] - np.sum(one.P[k] * scratch)
         for k in range(2, -1, -1):
             if one.bounds[k].variance > 0.0:
-                _through_update(one.bounds[k], adjoint, information, whole, scratch)
+                through_update(one.bounds[k], adjoint, information, whole, scratch)
         for k in range(3):  # Phi' adjoint and Phi' information Phi
             adjoint[3 + k] = one.way * adjoint[k] + one.kept * adjoint[3 + k]
         if whole:
@@ -365,25 +356,32 @@ def _backward(steps: np.ndarray, at: np.ndarray, rows: np.ndarray) -> tuple[floa
 
 
 @compiled
-def _through_update(
+def through_update(
     update: Record, adjoint: np.ndarray, information: np.ndarray, whole: bool, scratch: np.ndarray
 ) -> tuple[float, float]:
-    """Step adjoint (6,) and, if `whole`, information (6, 6) backwards through an UPDATE.
+    """Step adjoint (n,) and, if `whole`, information (n, n) backwards through a scalar update.
 
-    The equations are in `smoother._through_update`. Return the residual of the measurement to the
-    estimate by all others, and its variance, each over the variance: u and M.
+    The update is an UPDATE of the horizon or a RECORD of the history. The equations are lambda <- C'
+    lambda - h' y / S and Lambda <- C' Lambda C + h' h / S with C = I - K h. In the code:
+
+    - lambda, Lambda: adjoint, information
+    - h, K: update.jacobian, update.gain
+    - y, S: update.innovation and its update.variance
+
+    Return the residual of the measurement to the estimate by all others, and its variance, each over
+    the variance: u = K' lambda + y / S and M = K' Lambda K + 1 / S. scratch (n,) is overwritten.
     """
-    row, gain = update.jacobian, update.gain
+    row, gain, n = update.jacobian, update.gain, len(update.gain)
     u, M = update.innovation / update.variance, 1.0 / update.variance
-    for j in range(6):
+    for j in range(n):
         u += gain[j] * adjoint[j]
-    for k in range(3):
-        adjoint[k] -= u * row[k]
+    for j in range(n):
+        adjoint[j] -= u * row[j]
     if whole:
-        scratch[:] = np.sum(information * gain, axis=1)
+        scratch[:] = np.sum(information * gain, axis=1)  # Lambda K
         M += np.sum(gain * scratch)
-        for j in range(6):
-            for k in range(6):
+        for j in range(n):
+            for k in range(n):
                 information[j, k] += M * row[j] * row[k] - row[j] * scratch[k] - scratch[j] * row[k]
     return u, M
 
@@ -441,9 +439,7 @@ def _mix(ekf: Record, scores: np.ndarray, tdoa_std: float, top: float) -> None:
         covariance += weights[m] * (model.end_P + np.outer(apart, apart))
     _doubt_height(x, covariance, top)
     ekf.motion_ratio, ekf.noise_ratio = power, ratio
-    for h in range(HYPOTHESES):
-        if hypotheses.alive(ekf.hypotheses[h]):
-            hypotheses.set_state(ekf.hypotheses[h], x, covariance)
+    hypotheses.set_states(ekf, x, covariance)
 
 
 @compiled

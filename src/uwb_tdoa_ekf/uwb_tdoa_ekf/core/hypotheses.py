@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from . import auxiliary
 from .memory import HYPOTHESES, N_YAWS
-from .state import CHECK_PERIOD, difference
+from .state import CHECK_PERIOD, difference, isolate
 from .update import GATE
 
 YAW_STD = 0.6  # rad, of the yaw of each hypothesis: their yaws start 90 degrees apart
@@ -78,11 +78,16 @@ def set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None
 
 
 @compiled
+def set_states(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
+    """Set position and velocity of all hypotheses, see `set_state`."""
+    for h in range(HYPOTHESES):
+        set_state(ekf.hypotheses[h], x, covariance)
+
+
+@compiled
 def set_yaw_variance(hypothesis: Record, variance: float) -> None:
     """Set the variance of the yaw of a HYPOTHESIS, in rad^2, independent of all other states."""
-    hypothesis.P[8, :] = 0.0
-    hypothesis.P[:, 8] = 0.0
-    hypothesis.P[8, 8] = variance
+    isolate(hypothesis.P, 8, variance)
 
 
 @compiled

@@ -25,7 +25,7 @@ from . import (
 from .ground import SPEED, KnownHeight
 from .history import add_reset
 from .memory import HYPOTHESES, N_PLACES, N_YAWS, OFF, STARTED, WINDOW
-from .startup import APART, Places, inliers, level, locate, room_for, split
+from .startup import APART, Places, anywhere, inliers, level, locate, room_for, split
 from .state import CHECK_PERIOD, GRAVITY, turn_about_vertical, yaw_of
 from .workspace import ANY_YAW
 
@@ -102,15 +102,15 @@ def _search(
     parameters: Record,
     t: float,
     window: np.ndarray,
-    places: Places,
-) -> float:
+    count: int,
+) -> tuple[Places, float]:
     """Search for the tag in the surroundings of the anchors of a window (n,) of TDOA.
 
-    Places are filled. Return the share of TDOAs that agree with the first place.
+    Return `count` Places, and the share of TDOAs that agree with the first one.
     """
-    known = _known_height(ekf, parameters, t)
+    places, known = room_for(count), _known_height(ekf, parameters, t)
     _find_surroundings(ekf, window, anchors, parameters)
-    return locate(window, anchors, ekf.workspace, parameters, known, places)
+    return places, locate(window, anchors, ekf.workspace, parameters, known, places)
 
 
 @compiled
@@ -163,8 +163,8 @@ def start(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + CHECK_PERIOD
-    places, known = room_for(N_PLACES), _known_height(ekf, parameters, t)
-    share = _search(ekf, anchors, parameters, t, window, places)
+    known = _known_height(ekf, parameters, t)
+    places, share = _search(ekf, anchors, parameters, t, window, N_PLACES)
     stationary_position.sort_places(places, ekf, parameters)
     x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
@@ -229,8 +229,7 @@ def start_slowly(
         gap = max(gap, window[i].t - window[i - 1].t)
     if span < parameters.start_window or gap > LONGEST_GAP * span:
         return
-    places = room_for(N_PLACES)
-    share = _search(ekf, anchors, parameters, t, window, places)
+    places, share = _search(ekf, anchors, parameters, t, window, N_PLACES)
     stationary_position.sort_places(places, ekf, parameters)
     admitted = workspace.admits(ekf.workspace, places.x[0], places.covariance[0])
     if not (enough or (share >= AGREE and admitted)):
@@ -332,8 +331,8 @@ def relocate(
         or len(recent(ekf, parameters.start_window)) >= MINIMUM
     ):
         return
-    best, places = ekf.hypotheses[ekf.best], room_for(2)
-    share = _search(ekf, anchors, parameters, t, _last(ekf, t)[0], places)
+    best = ekf.hypotheses[ekf.best]
+    places, share = _search(ekf, anchors, parameters, t, _last(ekf, t)[0], N_PLACES)
     x, covariance, cost = places.x, places.covariance, places.cost
     variance = np.trace(covariance[0, :3, :3])
     if cost[1] < np.inf:
@@ -344,8 +343,7 @@ def relocate(
         or not workspace.admits(ekf.workspace, x[0], covariance[0])
     ):
         return
-    for h in range(HYPOTHESES):
-        hypotheses.set_state(ekf.hypotheses[h], x[0], covariance[0])
+    hypotheses.set_states(ekf, x[0], covariance[0])
     ekf.horizon.state = STARTED
     add_reset(ekf, t, history)
 
@@ -429,9 +427,7 @@ def set_pose(
         covariance[:, :] = best.P[:6, :6]
     else:
         workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
-        x[:3] = 0.5 * (ekf.workspace[0] + ekf.workspace[1])
-        covariance[:3, :3] = np.diag((0.5 * (ekf.workspace[1] - ekf.workspace[0])) ** 2)
-        covariance[3:, 3:] = SPEED**2 * np.eye(3)
+        anywhere(ekf.workspace, x, covariance)
     for k in range(3):
         if math.isnan(pose.p[k]):
             continue
@@ -528,7 +524,7 @@ def recover(
     anchors: np.ndarray,
     parameters: Record,
     t: float,
-    anywhere: bool,
+    lost: bool,
     history: np.ndarray,
 ) -> None:
     """Move the filter to another position if the TDOAs of the window agree on it.
@@ -548,7 +544,7 @@ def recover(
         Tuning of the filter.
     t : float
         Stamp, s.
-    anywhere : bool
+    lost : bool
         Whether the tag may be anywhere. Then no limit applies, and several places are followed.
     history : (n,) RECORD
         History for the smoother; empty for no recording.
@@ -557,16 +553,15 @@ def recover(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + CHECK_PERIOD
-    count = N_PLACES if anywhere else 1
-    places = room_for(count)
-    share = _search(ekf, anchors, parameters, t, window, places)
+    count = N_PLACES if lost else 1
+    places, share = _search(ekf, anchors, parameters, t, window, count)
     x, covariance, cost = places.x, places.covariance, places.cost
     explained = np.mean(inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6]))
-    near = anywhere and workspace.distance_outside(ekf.workspace, x[0]) <= workspace.STD
+    near = lost and workspace.distance_outside(ekf.workspace, x[0]) <= workspace.STD
     admitted = near or workspace.admits(ekf.workspace, x[0], covariance[0])
     if share < AGREE_RECOVERY or not admitted:
         return
-    if anywhere and cost[count - 1] < np.inf:
+    if lost and cost[count - 1] < np.inf:
         _reopen(ekf, cost)
     elif share < CLEARLY_MORE + explained:
         return
@@ -578,10 +573,10 @@ def recover(
         and t - ekf.imu.t < parameters.imu_timeout
         and hypotheses.alike(ekf)
     )
-    if not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t):
+    if not lost and wheels and _outweighs(ekf, anchors, window, x[0], t):
         return
     away = math.sqrt(np.sum((x[0, :3] - ekf.hypotheses[ekf.best].x[:3]) ** 2))
-    if not anywhere and (felt or wheels) and away > reach(ekf, t):
+    if not lost and (felt or wheels) and away > reach(ekf, t):
         if felt and t - ekf.last_agreement > IMU_CONTRADICTED:
             _leave_imu_out(ekf, t, away)
         return
@@ -594,7 +589,7 @@ def recover(
             # wheels have led to a wrong place: a wrong yaw is a probable cause
             hypotheses.set_yaw_variance(hypothesis, ANY_YAW**2)
     ekf.rival_since, ekf.horizon.state = -np.inf, OFF
-    if anywhere:  # the information from before the silence belongs to another place
+    if lost:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     else:
         ekf.recovered = t

@@ -353,6 +353,15 @@ RESIDUAL = _record(
 )
 
 
+@compiled
+def fill_residual(residual: Record, innovation: Record, weight: float) -> None:
+    """Fill in the RESIDUAL of an INNOVATION that was used with a weight, or rejected with weight 0."""
+    residual.innovation = innovation.value
+    residual.variance = innovation.prior_variance + innovation.noise_variance
+    residual.weight = weight
+    residual.verdict = USED if weight > 0.0 else REJECTED
+
+
 class FilterState(NamedTuple):
     """State of a filter.
 

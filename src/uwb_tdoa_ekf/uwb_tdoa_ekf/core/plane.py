@@ -19,7 +19,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import height, hypotheses, velocity
 from .history import add_update
 from .memory import HYPOTHESES
-from .state import CONSTRAINT_PERIOD, rotation, yaw_of
+from .state import CONSTRAINT_PERIOD, isolate, rotation, yaw_of
 from .update import GATE, kalman, kalman_direct, kalman_robust, project
 
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
@@ -136,11 +136,10 @@ def flatten(row: Record, parameters: Record, wrong: float) -> None:
     x[6], x[7], x[8], x[9] = 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
     row.consider_covariance[2, :] = 0.0
     row.consider_covariance[:, 2] = 0.0
-    for state in (2, 5, 6, 7):
-        P[state, :] = 0.0
-        P[:, state] = 0.0
-    P[2, 2], P[5, 5] = parameters.fixed_height_std**2 + wrong**2, RISE_STD**2
-    P[6, 6] = P[7, 7] = parameters.tilt_std**2
+    isolate(P, 2, parameters.fixed_height_std**2 + wrong**2)
+    isolate(P, 5, RISE_STD**2)
+    isolate(P, 6, parameters.tilt_std**2)
+    isolate(P, 7, parameters.tilt_std**2)
 
 
 @compiled

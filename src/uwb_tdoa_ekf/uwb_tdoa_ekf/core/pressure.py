@@ -16,7 +16,7 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, add_offset_jacobian
 from .height import GATE, MEMORY
 from .hypotheses import alive
-from .memory import REJECTED, USED
+from .memory import REJECTED, fill_residual
 from .update import kalman_robust, project
 
 # Set on the six flights of 0425/TDOA2, see docs/notebook/auxiliary_sensors.md.
@@ -68,8 +68,7 @@ def observe(
             step = min(1.0, dt / AVERAGE)
             barometer.nis += step * (min(normalized**2, GATE**2) * excess - barometer.nis)
             barometer.nis = min(barometer.nis, WORST**2)
-            residual.innovation, residual.variance, residual.weight = innovation.value, total, w
-            residual.verdict = USED if w > 0.0 else REJECTED
+            fill_residual(residual, innovation, w)
             if w > 0.0:
                 barometer.agreed = sensor.t
     if anew:

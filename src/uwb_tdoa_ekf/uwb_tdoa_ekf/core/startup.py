@@ -21,7 +21,9 @@ from .ground import SPEED, KnownHeight, inverse, solve
 from .hypotheses import IMPROBABLE
 from .workspace import configured_side, principal_axis, reflect, rows_heard
 
-STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
+# starts: the middle of the workspace, and the corners of the half-size box around it
+CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+STARTS = np.concatenate((np.zeros((1, 3)), CORNERS))  # in units of half the workspace
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
@@ -102,15 +104,13 @@ def locate(
     prior_information = 1.0 / prior_std**2
     rows = rows_heard(window)
     correlation_length = max(1.0, len(window) / max(1.0, len(rows) - 1.0))
-    trials, losses = np.empty((STARTS, 6)), np.empty(STARTS)
+    trials, losses = np.empty((len(STARTS), 6)), np.empty(len(STARTS))
     residuals, system = np.zeros(len(window)), np.zeros((6, 7))
     side = configured_side(rows, anchors, parameters.tag_side)
-    for start in range(STARTS):
+    for start in range(len(STARTS)):
         trial = trials[start]
         trial[:] = mean
-        for k in range(3):
-            if start > 0:
-                trial[k] += 0.5 * prior_std[k] * (1.0 if ((start - 1) >> k) & 1 else -1.0)
+        trial[:3] += STARTS[start] * prior_std[:3]
         for sweep in range(SWEEPS):
             scale = max(COARSE * 0.7**sweep, FINE)
             reflect(trial, side)
@@ -137,10 +137,22 @@ def locate(
         covariance[place] = inverse(system[:, :6]) * variance
         if place == 0:
             share = float(np.mean(np.abs(residuals) < INLIER))
-        for other in range(STARTS):
+        for other in range(len(STARTS)):
             if np.sum((trials[other, :3] - x[place, :3]) ** 2) < APART**2:
                 losses[other] = np.inf
     return share
+
+
+@compiled
+def anywhere(workspace: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> None:
+    """Fill in the state x (6,) and covariance (6, 6) of a tag anywhere in its workspace (2, 3), m.
+
+    Both must be 0 before.
+    """
+    for k in range(3):
+        x[k] = 0.5 * (workspace[0, k] + workspace[1, k])
+        covariance[k, k] = (0.5 * (workspace[1, k] - workspace[0, k])) ** 2
+        covariance[3 + k, 3 + k] = SPEED**2
 
 
 @compiled

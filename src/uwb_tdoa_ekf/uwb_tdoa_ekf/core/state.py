@@ -23,6 +23,8 @@ CONSTRAINT_PERIOD = 0.05  # s between two updates of a tag at rest, or of a vehi
 NOMINAL_STATES, ERROR_STATES = 16, 15
 MOVING_STATES = 9  # first error states; the states behind are biases, which only random-walk
 
+Quaternion = tuple[float, float, float, float]  # x, y, z, w
+
 # Transition of the error state over a step: the blocks that differ from the identity, see
 # `propagate`.
 TRANSITION = np.dtype(
@@ -54,11 +56,22 @@ def rotation(qx: float, qy: float, qz: float, qw: float, R: np.ndarray) -> None:
 
 
 @compiled
-def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, float]:
+def exponential(r0: float, r1: float, r2: float) -> Quaternion:
     """Return Exp(r): the quaternion (x, y, z, w) of a rotation vector in rad."""
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
     s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
     return s * r0, s * r1, s * r2, math.cos(0.5 * angle)
+
+
+@compiled
+def product(a: Quaternion, b: Quaternion) -> Quaternion:
+    """Return the product a * b of two quaternions."""
+    return (
+        a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
+        a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0],
+        a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3],
+        a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2],
+    )
 
 
 @compiled
@@ -67,13 +80,9 @@ def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
 
     b is the unit quaternion (bx, by, bz, bw) of the rotation.
     """
-    ax, ay, az, aw = x[6], x[7], x[8], x[9]
-    qx = aw * bx + ax * bw + ay * bz - az * by
-    qy = aw * by - ax * bz + ay * bw + az * bx
-    qz = aw * bz + ax * by - ay * bx + az * bw
-    qw = aw * bw - ax * bx - ay * by - az * bz
-    n = 1.0 / math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
-    x[6], x[7], x[8], x[9] = qx * n, qy * n, qz * n, qw * n
+    q = product((x[6], x[7], x[8], x[9]), (bx, by, bz, bw))
+    n = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    x[6], x[7], x[8], x[9] = q[0] * n, q[1] * n, q[2] * n, q[3] * n
 
 
 @compiled
@@ -81,10 +90,17 @@ def inject(x: np.ndarray, direction: np.ndarray, size: float) -> None:
     """Add the error direction * size, (15,), to the nominal state x (16,)."""
     for j in range(6):
         x[j] += direction[j] * size
-    bx, by, bz, bw = exponential(direction[6] * size, direction[7] * size, direction[8] * size)
-    turn(x, bx, by, bz, bw)
+    turn(x, *exponential(direction[6] * size, direction[7] * size, direction[8] * size))
     for j in range(9, ERROR_STATES):
         x[j + 1] += direction[j] * size
+
+
+@compiled
+def isolate(P: np.ndarray, state: int, variance: float) -> None:
+    """Make an error state independent of all others in a covariance P, with a variance."""
+    P[state, :] = 0.0
+    P[:, state] = 0.0
+    P[state, state] = variance
 
 
 @compiled
@@ -286,12 +302,8 @@ def difference(
 
     dtheta is the rotation vector in the body frame of a, as `inject` adds it.
     """
-    ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]  # inverse attitude of a
-    bx, by, bz, bw = b[6], b[7], b[8], b[9]
-    x = aw * bx + ax * bw + ay * bz - az * by
-    y = aw * by - ax * bz + ay * bw + az * bx
-    z = aw * bz + ax * by - ay * bx + az * bw
-    w = aw * bw - ax * bx - ay * by - az * bz
+    inverse = -a[6], -a[7], -a[8], a[9]
+    x, y, z, w = product(inverse, (b[6], b[7], b[8], b[9]))
     if w < 0.0:
         x, y, z, w = -x, -y, -z, -w
     norm = math.sqrt(x * x + y * y + z * z)

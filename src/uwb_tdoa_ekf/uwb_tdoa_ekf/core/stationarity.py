@@ -18,7 +18,7 @@ from .history import add_update, replace_velocity
 from .inertial import SHAKING_MEMORY
 from .initialization import recent
 from .memory import HYPOTHESES
-from .state import CHECK_PERIOD, CONSTRAINT_PERIOD, GRAVITY, rotation
+from .state import CHECK_PERIOD, CONSTRAINT_PERIOD, GRAVITY, isolate, rotation
 from .stationary_position import SPEED_STD
 from .update import GATE, kalman_direct
 
@@ -76,9 +76,7 @@ def detect_liftoff(ekf: Record, sample: Record, dt: float, records: np.ndarray) 
         hypothesis = ekf.hypotheses[h]
         for k in range(3, 6):
             hypothesis.x[k] = ekf.lift[k - 3] if ekf.quiet or k == 5 else 0.0
-            hypothesis.P[k, :] = 0.0
-            hypothesis.P[:, k] = 0.0
-            hypothesis.P[k, k] = LIFT**2
+            isolate(hypothesis.P, k, LIFT**2)
             hypothesis.offset_cross[:, k] = 0.0
     replace_velocity(ekf, records)
     ekf.resting, ekf.next_look = False, sample.t + AWAY

@@ -17,12 +17,14 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import ground
 from .ground import Evidence, KnownHeight
 from .history import add_reset, add_update
-from .hypotheses import alive, set_state
+from .hypotheses import alive, set_states
 from .memory import HYPOTHESES
 from .startup import Places
 from .update import GATE, kalman_direct
 from .workspace import surround
 
+# starts on the ground, in units of the size of the box around the anchors
+QUARTERS = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
 NEAR = 1.0  # m beyond the anchors that a tag is expected in
 EXPLANATIONS = 4  # somewhere else, and on the ground with each lateness of ground.explain
 # m/s, of a tag at rest, in addition to the uncertainty from its TDOAs; a quiet tag that is known to
@@ -83,12 +85,8 @@ def weigh_explanations(
     prior[0] = 0.5 * (bounds[0] + bounds[1])
     prior[1:] = np.diag(1.0 / (0.5 * (bounds[1] - bounds[0])) ** 2)
     evidence = Evidence(pairs, anchors, bounds, prior, parameters)
-    starts, near = np.empty((4, 2)), _near_anchors(ekf, parameters)
-    for start in range(4):
-        for k in range(2):
-            starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (
-                0.75 if (start >> k) & 1 else 0.25
-            )
+    near = _near_anchors(ekf, parameters)
+    starts = near[0, :2] + (near[1, :2] - near[0, :2]) * QUARTERS
     explained = _explanations(ekf, evidence, height, x[:3], starts)
     explained.cost[0] += _absurdity(near, x)
     explained.x[0], explained.covariance[0] = x[:3], covariance[:3, :3]
@@ -328,7 +326,6 @@ def set_position(
     x, of_x = np.zeros(6), np.zeros((6, 6))
     x[:3], of_x[:3, :3] = position, covariance
     set_at_rest(x, of_x, ekf.still_covariance)
-    for h in range(HYPOTHESES):
-        set_state(ekf.hypotheses[h], x, of_x)
+    set_states(ekf, x, of_x)
     ekf.consistency = 1.0
     add_reset(ekf, t, records)

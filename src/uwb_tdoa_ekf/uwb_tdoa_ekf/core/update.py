@@ -67,8 +67,7 @@ INNOVATION = np.dtype(
 def project(P: np.ndarray, innovation: Record) -> None:
     """Compute prior_variance and cross_covariance of an INNOVATION from the prior P (15, 15)."""
     covariance = innovation.cross_covariance
-    for j in range(ERROR_STATES):
-        covariance[j] = 0.0
+    covariance[:] = 0.0
     for n in range(innovation.entries):
         state, entry = innovation.states[n], innovation.row[n]
         for j in range(ERROR_STATES):

@@ -141,11 +141,9 @@ def stay_on_side(hypothesis: Record, side: np.ndarray) -> bool:
         return False
     axis, P = int(side[0]), hypothesis.P
     for state in (axis, 3 + axis):
-        for j in range(len(P)):
-            P[state, j], P[j, state] = -P[state, j], -P[j, state]
-        P[state, state] = abs(P[state, state])
-        for j in range(len(hypothesis.offset_cross)):
-            hypothesis.offset_cross[j, state] = -hypothesis.offset_cross[j, state]
+        P[state, :] = -P[state, :]
+        P[:, state] = -P[:, state]
+        hypothesis.offset_cross[:, state] = -hypothesis.offset_cross[:, state]
     return True
 
 
