@@ -1,7 +1,9 @@
 # Copyright uwb_tdoa maintainers
 # SPDX-License-Identifier: Apache-2.0
 
+from contextlib import redirect_stdout
 from dataclasses import replace
+import io
 import json
 import shlex
 from types import SimpleNamespace
@@ -133,13 +135,36 @@ def test_rosbags_reads_the_recordings_by_their_names(recorded):
 
 
 @pytest.fixture(scope="module")
-def diagnosis(recorded):
+def loop(recorded):
+    """Run the demo with these recordings. Return its folder, its output and its Diagnosis."""
+    folder, printed, found = recorded[0].parent, io.StringIO(), []
+
+    def recordings(*given):
+        assert given == (LATE, folder)
+        return recorded
+
+    def undeclared(flights, **options):
+        """Diagnose while no effect is declared."""
+        assert [flight.name for flight in flights] == ["flight-1", "flight-2"]
+        with pytest.MonkeyPatch.context() as patch:
+            for module in (inject, flown):
+                patch.delattr(module, "hidden_effect")
+            patch.setattr(inject, "KINDS", {})
+            found.append(diagnose(flights, **options))
+        return found[-1]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
+        patch.setattr(flown, "record", recordings)
+        patch.setattr(flown, "diagnose", undeclared)
+        words = ["--seed", str(LATE), "--out", str(folder), "--json", str(folder / "demo.json")]
+        assert demo.main(words) == 0
+    return SimpleNamespace(folder=folder, out=printed.getvalue(), diagnosis=found[0])
+
+
+@pytest.fixture(scope="module")
+def diagnosis(loop):
     """Return the Diagnosis of the first two recordings. No effect is declared."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (inject, flown):
-            patch.delattr(module, "hidden_effect")
-        patch.setattr(inject, "KINDS", {})
-        return diagnose(flown.read(recorded[:2]))
+    return loop.diagnosis
 
 
 @pytest.mark.slow
@@ -253,26 +278,23 @@ def lines_of(printed, title):
 
 
 @pytest.mark.slow
-def test_the_loop_through_the_real_nodes(tmp_path, capsys):
-    figures = tmp_path / "demo.json"
-    assert demo.main(["--seed", str(LATE), "--out", str(tmp_path), "--json", str(figures)]) == 0
-    printed = capsys.readouterr()
+def test_the_loop_through_the_real_nodes(loop, recorded):
     for title in ("recorded", "residual", "traced to  anchor_delay", "added", "flown", "error"):
-        assert len(lines_of(printed, title)) == 1, title
-    assert "no message lost or late" in lines_of(printed, "flown")[0]
-    assert lines_of(printed, "really     anchor_delay: 6 = 0.286 (m)")
-    content = json.loads(figures.read_text())
+        assert len(lines_of(loop, title)) == 1, title
+    assert "no message lost or late" in lines_of(loop, "flown")[0]
+    assert lines_of(loop, "really     anchor_delay: 6 = 0.286 (m)")
+    content = json.loads((loop.folder / "demo.json").read_text())
     errors = [row["rmse_3d"] for row in content["errors"]]
     assert errors[1] < 0.3 * errors[0]
-    (third,) = flown.read([tmp_path / "flight-3_bag"])
-    for name, model in (("without", None), ("with", load_network(tmp_path / "bias.onnx"))):
-        live = read_odometry(tmp_path / name / "recorded_bag")
+    (third,) = flown.read(recorded[2:])
+    for name, model in (("without", None), ("with", load_network(loop.folder / "bias.onnx"))):
+        live = read_odometry(loop.folder / name / "recorded_bag")
         offline = FlightEstimator(network=model)(third).odometry
         n = len(live.t)
         assert n > len(offline) - 5  # the nodes wait for messages after the last TDOA
         for field in ("t", "p", "q"):
             np.testing.assert_array_equal(getattr(live, field), getattr(offline, field)[:n])
-    assert (tmp_path / "demo.png").stat().st_size > 10_000
+    assert (loop.folder / "demo.png").stat().st_size > 10_000
 
 
 # --- a measured flight ---
