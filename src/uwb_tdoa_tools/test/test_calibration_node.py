@@ -12,7 +12,7 @@ import subprocess
 import threading
 import time
 
-from known_effects import clean_flight
+from known_effects import sparse_flight
 import numpy as np
 import pytest
 import yaml
@@ -204,7 +204,7 @@ def run():
 def recorded(tmp_path_factory):
     """A bag of three pieces and a rest, with anchors as a tape has them, and their file."""
     folder = tmp_path_factory.mktemp("recorded")
-    flight = clean_flight(300, 3.1 * PIECE)
+    flight = sparse_flight(300, 3.1 * PIECE)
     off = np.random.default_rng(7).normal(0.0, TAPE, flight.anchors.positions.shape)
     flight = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
     write_bag(flight, folder / "bag")
