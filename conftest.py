@@ -32,13 +32,12 @@ except ImportError:  # without ROS: the tests of the cores need none
 # Reserved domains, oldest first. Each stays reserved until this process ends or KEPT newer follow.
 _taken = deque()
 # Test files that take half a minute or more, the longest first.
-LONGEST = """checking_check calibrating launch_files distribution walks commands moved_anchors
-    diagnosis_attribution diagnosis_streams diagnosis_channels
-    waiting surveying diagnosis_diagnose lockstep plan demo hall stream_faults clock_recordings
-    vehicle_node python_api lint study_faults localizing diagnosis_validation study_bench
-    checking_report diagnosis_report study_plans first_map live_replay train alignment warehouse
-    rerun profiles evaluate study_odd_messages stream_watch nodes both_nodes surroundings
-    checking_trials callees""".split()
+LONGEST = """surveying walks checking_check distribution commands diagnosis_diagnose
+    checking_trials diagnosis_attribution surveying_stream lockstep calibrating first_map studies
+    moved_anchors demo launch_files diagnosis_channels diagnosis_streams planning_layouts
+    python_api hall waiting vehicle_node diagnosis_validation localizing stream_faults rovers
+    profiles stream_watch study_bench calibration_node planning_hall startup nodes study_faults
+    plan flying_trial clock_recordings lint checking_report alignment""".split()
 USES_ROS = re.compile(r'(importorskip\("|^from |^import )(rclpy|uwb_tdoa_msgs)', re.MULTILINE)
 # Number of later tests that may not reuse the domain of a test.
 # A killed node stays visible for 20 s.
