@@ -375,7 +375,7 @@ def _by_error(
         )
         model = selected.applied(attribution)
         effects = with_calibration(base, attribution.of_floor, None)
-        cases = [replace(case, effects=effects) for case in cases]
+        cases = [replace(case, effects=effects, untold=0.0) for case in cases]
         after = before
         if attribution.of_floor:
             before, after = judged(cases)

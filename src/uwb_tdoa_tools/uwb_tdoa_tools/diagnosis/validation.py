@@ -87,10 +87,9 @@ class ValidatedSelection:
         If the functions are independent in another flight, their mean leaves 1 - 1 / n of its power.
         """
         selection, total = self.selection.beside(attribution.selection), 0.0
-        for one, rivals in zip(selection.chosen, selection.rivals):
-            count = 1 + sum(rival.is_alike for rival in rivals)
+        for one, alike in zip(selection.chosen, selection.alike):
             power = (self.error + self.worth.get(one, 0.0)) ** 2 - self.error**2
-            total += (1.0 - 1.0 / count) * max(power, 0.0)
+            total += (1.0 - 1.0 / (1 + len(alike))) * max(power, 0.0)
         return total
 
     def applied(self, attribution: Attribution) -> Attribution:

@@ -115,16 +115,16 @@ class Selection:
 
         share, rows : as of `refit`
         """
-        chosen = self._chosen_of(candidates)
-        columns = self.columns(chosen["chosen"])
+        part = replace(self, **self._chosen_of(candidates))
+        columns = self.columns(part.chosen)
         fits, weights = [refit(self.table, columns, self.fit, rows, share)], [1.0]
-        for one, alike in zip(chosen["chosen"], map(_alike, chosen["rivals"])):
+        for one, alike in zip(part.chosen, part.alike):
             rest = [column for column in columns if column not in one.columns]
             for other in alike:
                 fits.append(refit(self.table, [*rest, *other.columns], self.fit, rows, share))
                 weights.append(1.0 / (1 + len(alike)))
                 weights[0] -= weights[-1]
-        return replace(self, **chosen, fit=mean_of(fits, weights))
+        return replace(part, fit=mean_of(fits, weights))
 
     def beside(self, other: Selection) -> Selection:
         """Return the Selection with the rivals that another one has for the same Candidates."""
@@ -134,10 +134,17 @@ class Selection:
         return replace(self, rivals=rivals, table=self.table.with_terms(terms))
 
     @property
+    def alike(self) -> list[list[Candidate]]:
+        """Return of each chosen function those that explain as much, and that nodes can correct."""
+        return [
+            [rival.candidate for rival in rivals if rival.is_alike and not one.declared]
+            for one, rivals in zip(self.chosen, self.rivals)
+        ]
+
+    @property
     def terms(self) -> list[Term]:
         """Return the Terms whose values the Fit has: those of functions that explain as much, too."""
-        alike = chain.from_iterable(map(_alike, self.rivals))
-        fitted = set(self.fit.columns)
+        alike, fitted = chain.from_iterable(self.alike), set(self.fit.columns)
         several = [*self.chosen, *(one for one in alike if fitted.issuperset(one.columns))]
         return [term for candidate in several for term in candidate.terms]
 
@@ -171,10 +178,6 @@ class Selection:
         return replace(
             self, chosen=chosen, fit=model, loss=(*self.loss, 0.0), rivals=(*self.rivals, ())
         )
-
-
-def _alike(rivals: Sequence[Rival]) -> list[Candidate]:
-    return [rival.candidate for rival in rivals if rival.is_alike]
 
 
 def select(
