@@ -258,6 +258,12 @@ def test_of_what_flights_explain_alike_the_mean_is_applied():
     assert corrected < error
     assert low < 1.0 - corrected / error < high
     assert "their mean is applied" in str(verdict(found))
+    assert "held already" not in str(verdict(found))
+    # the finding is the function itself, the file has its share
+    functions = (one.effect for one in found.findings if one.added and one.function)
+    (whole,) = (one for one in functions if one.arguments == ("x",))
+    (share,) = (one for one in found.effects if one.merge_key == whole.merge_key)
+    assert whole.values == pytest.approx({key: 2.0 * value for key, value in share.values.items()})
 
 
 @pytest.mark.slow

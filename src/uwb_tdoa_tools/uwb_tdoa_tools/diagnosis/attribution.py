@@ -569,7 +569,8 @@ def _findings(
     effects = {entry_of(effect): effect for effect in effects_of(selection)}
     out: dict[Hashable, EffectFinding] = {}
     of_anchors = levels(selection, candidates)
-    for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
+    rows = zip(selection.chosen, held_out(selection), selection.loss, selection.shared)
+    for candidate, score, loss, shared in rows:
         evidence = {
             "criterion": round(float(loss), 1),
             "held_out_gain": round(score.gain, 1),
@@ -578,6 +579,10 @@ def _findings(
         others = tuple(alternatives(selection, candidate, candidates))
         for term in candidate.terms:
             identity = entry_of(term.effect)
+            effect, n = effects[identity], 1 + len(shared)
+            values, std = (
+                {k: n * x for k, x in each.items()} for each in (effect.values, effect.std)
+            )
             beside = (
                 [other.function for other in candidate.terms if other is not term]
                 if term.function
@@ -585,7 +590,7 @@ def _findings(
             )
             covariates = tuple(function.covariate for function in beside if function)
             finding = EffectFinding(
-                effects[identity],
+                replace(effect, values=values, std=std),
                 next(name for name in candidate.channels if name in selection.table.present),
                 evidence,
                 score.explained,

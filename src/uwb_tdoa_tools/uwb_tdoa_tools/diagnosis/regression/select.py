@@ -142,10 +142,15 @@ class Selection:
         ]
 
     @property
+    def shared(self) -> list[list[Candidate]]:
+        """Return of each chosen Candidate those of `alike` with which the Fit has their mean."""
+        fitted = set(self.fit.columns)
+        return [[one for one in some if fitted.issuperset(one.columns)] for some in self.alike]
+
+    @property
     def terms(self) -> list[Term]:
-        """Return the Terms whose values the Fit has: those of functions that explain as much, too."""
-        alike, fitted = chain.from_iterable(self.alike), set(self.fit.columns)
-        several = [*self.chosen, *(one for one in alike if fitted.issuperset(one.columns))]
+        """Return the Terms whose values the Fit has."""
+        several = [*self.chosen, *chain.from_iterable(self.shared)]
         return [term for candidate in several for term in candidate.terms]
 
     def where(self, keeps: Callable[[Effect], bool]) -> Selection:

@@ -413,8 +413,7 @@ def _shared(diagnosis: Diagnosis) -> list[str]:
 
 def _caveats(diagnosis: Diagnosis) -> list[str]:
     out = []
-    base = len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
-    if base > 0:
+    if base := len(diagnosis.base):
         effects = "effects" if base > 1 else "effect"
         out.append(f"Before is with the {base} {effects} that the model held already.")
     count = len(diagnosis.flights)
