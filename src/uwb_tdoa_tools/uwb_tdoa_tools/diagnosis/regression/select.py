@@ -34,8 +34,8 @@ LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate
 AMBIGUOUS = 10.0  # smallest gap of the criterion that decides between two candidates
 # largest relative gap of the criterion of a rival function
 ALIKE = 0.1
-# the same of functions that the flights do not tell apart: a simple function is never exact
-SAME, IDENTICAL = 0.05, 1e-9
+# the same of functions that the flights do not tell apart (docs/notebook/diagnosis.md)
+SAME, IDENTICAL = 0.02, 1e-9
 
 
 class Search(Protocol):
