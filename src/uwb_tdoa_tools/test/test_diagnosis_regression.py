@@ -212,9 +212,9 @@ def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
     assert np.abs(spoilt.only([delay]).fit.beta - half.beta).max() > 1e-4
 
 
-def over(covariate):
+def over(covariate, anchor="4"):
     term = SmoothTerm(covariate=covariate, form="anchor", knots=(-2.0, 2.0), shape="line")
-    return Candidate((Term(term, term.keys_of(("4",))),))
+    return Candidate((Term(term, term.keys_of((anchor,))),))
 
 
 def test_of_functions_that_explain_alike_the_mean_is_kept(late):
@@ -222,9 +222,14 @@ def test_of_functions_that_explain_alike_the_mean_is_kept(late):
     delay, one, same, worse = named(candidates, "anchor_delay"), *map(over, ("x", "y", "height"))
     table = table.with_terms([each.terms[0] for each in (one, same, worse)])
     selection = select(table, [delay], fit(table, columns_of(candidates)).inflation).plus(one)
-    told = replace(
-        selection, rivals=((), (Rival(1.0, same, 0.5 * SAME), Rival(9.0, worse, 2.0 * SAME)))
+    rivals = (
+        Rival(1.0, same, 0.5 * SAME),
+        Rival(9.0, worse, 2.0 * SAME),
+        Rival(-9.0, over("range"), -2.0 * SAME),
+        Rival(0.0, over("elevation"), 0.0),
+        Rival(1.0, over("y", "5"), 0.5 * SAME),
     )
+    told = replace(selection, rivals=((), rivals))
     for share, rows in ((None, None), (0.7, table.block % 2 == 0)):
         kept = selection.beside(told).kept([delay, one], share, rows).fit
         several = [

@@ -60,13 +60,15 @@ class Rival:
     candidate: Candidate
     lacks: float
 
-    @property
-    def is_alike(self) -> bool:
-        """Return whether it is a function that nodes can correct, and that explains as much."""
-        one = self.candidate
-        usable = all(term.effect.usable for term in one.terms)
+    def is_alike(self, other: Candidate) -> bool:
+        """Return whether it explains as much as another function of the same anchor or pair.
+
+        It must be a function that nodes can correct.
+        """
+        one, usable = self.candidate, all(term.effect.usable for term in self.candidate.terms)
         # With no gap at all it is the same function by another name.
-        return IDENTICAL < abs(self.lacks) and self.lacks <= SAME and usable and not one.declared
+        near = IDENTICAL < abs(self.lacks) <= SAME
+        return near and usable and not other.declared and one.subject == other.subject
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,7 @@ class Selection:
     def alike(self) -> list[list[Candidate]]:
         """Return of each chosen function those that explain as much, and that nodes can correct."""
         return [
-            [rival.candidate for rival in rivals if rival.is_alike and not one.declared]
+            [rival.candidate for rival in rivals if rival.is_alike(one)]
             for one, rivals in zip(self.chosen, self.rivals)
         ]
 

@@ -85,6 +85,12 @@ class Candidate:
         return self.terms[0].function is None
 
     @property
+    def subject(self) -> set[tuple[str, str]]:
+        """Return (form, anchor or pair) of its functions without a name."""
+        functions = [(term.function, key) for term in self.terms for key in term.keys]
+        return {(one.form, key.rpartition(".")[0]) for one, key in functions if one}
+
+    @property
     def label(self) -> str:
         """Return its name in reports."""
         more = (f" + {term.function.covariate}" for term in self.terms[1:] if term.function)
