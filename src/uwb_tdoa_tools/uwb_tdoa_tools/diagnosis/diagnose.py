@@ -354,7 +354,8 @@ def _by_error(
         model, fitted, held_out, base, effects, selected.share
     )
     if not held_out:
-        cases = [replace(case, untold=selected.untold(attribution)) for case in cases]
+        untold = selected.untold(attribution)
+        cases = [replace(case, untold=untold) for case in cases]
     judged = partial(
         comparison.compare,
         baseline=baseline,

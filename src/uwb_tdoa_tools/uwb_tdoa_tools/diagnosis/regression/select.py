@@ -34,7 +34,7 @@ LEAST_DETERMINED = 0.3  # smallest effective number of parameters of a candidate
 AMBIGUOUS = 10.0  # smallest gap of the criterion that decides between two candidates
 # largest relative gap of the criterion of a rival function
 ALIKE = 0.1
-# the same of functions that the flights do not tell apart (docs/notebook/diagnosis.md)
+# the same of rivals that explain as much, and of those that are equal (docs/notebook/diagnosis.md)
 SAME, IDENTICAL = 0.02, 1e-9
 
 
@@ -63,12 +63,12 @@ class Rival:
     def is_alike(self, other: Candidate) -> bool:
         """Return whether it explains as much as another function of the same anchor or pair.
 
-        It must be a function that nodes can correct.
+        It must be a function that nodes can correct. Without any gap it is the same function by
+        another name.
         """
-        one, usable = self.candidate, all(term.effect.usable for term in self.candidate.terms)
-        # With no gap at all it is the same function by another name.
         near = IDENTICAL < abs(self.lacks) <= SAME
-        return near and usable and not other.declared and one.subject == other.subject
+        usable = all(term.effect.usable for term in self.candidate.terms)
+        return near and usable and not other.declared and self.candidate.subject == other.subject
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,8 +112,8 @@ class Selection:
         """Return the Selection of some of the chosen Candidates, with the present weights.
 
         With these weights, contributions of the dropped candidates do not count as outliers. The
-        flights do not tell a function from those that explain as much, but other flights may. So the
-        mean of these functions is kept, each fitted in its place.
+        flights do not tell a function from its rivals in `alike`, but other flights may. So the Fit
+        is the mean of fits with each of them.
 
         share, rows : as of `refit`
         """
@@ -129,15 +129,18 @@ class Selection:
         return replace(part, fit=mean_of(fits, weights))
 
     def beside(self, other: Selection) -> Selection:
-        """Return the Selection with the rivals that another one has for the same Candidates."""
+        """Return the Selection with the rivals that another one has for the same Candidates.
+
+        The table gets the columns of those in `alike`.
+        """
         known = dict(zip(other.chosen, other.rivals))
-        rivals = tuple(known.get(one, ()) for one in self.chosen)
-        terms = [term for one in chain.from_iterable(rivals) for term in one.candidate.terms]
-        return replace(self, rivals=rivals, table=self.table.with_terms(terms))
+        told = replace(self, rivals=tuple(known.get(one, ()) for one in self.chosen))
+        terms = [term for one in chain.from_iterable(told.alike) for term in one.terms]
+        return replace(told, table=self.table.with_terms(terms))
 
     @property
     def alike(self) -> list[list[Candidate]]:
-        """Return of each chosen function those that explain as much, and that nodes can correct."""
+        """Return, for each chosen Candidate, the rivals that explain as much."""
         return [
             [rival.candidate for rival in rivals if rival.is_alike(one)]
             for one, rivals in zip(self.chosen, self.rivals)
@@ -145,7 +148,7 @@ class Selection:
 
     @property
     def shared(self) -> list[list[Candidate]]:
-        """Return of each chosen Candidate those of `alike` with which the Fit has their mean."""
+        """Return, for each chosen Candidate, the rivals of `alike` that the Fit holds too."""
         fitted = set(self.fit.columns)
         return [[one for one in some if fitted.issuperset(one.columns)] for some in self.alike]
 

@@ -435,8 +435,8 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
         out.append(f"The 95 % interval of the gain of another flight is {percent(elsewhere)}.")
     if any(case.untold > 0.0 for case in diagnosis.cases):
         out.append(
-            "Several functions explain these flights alike, and their mean is applied. A flight on "
-            "which they differ tells which one is the cause."
+            "These flights do not show which of several functions is the cause, so their mean is "
+            "applied. To find the cause, fly where they differ."
         )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
