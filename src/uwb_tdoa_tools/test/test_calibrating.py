@@ -449,9 +449,17 @@ def test_a_sensor_that_is_switched_off_stays_off_in_what_is_written_and_printed(
     file = write_parameters(tmp_path / "ekf_node.yaml", std, config)
     expected = config if std is None else replace(config, tdoa_std=std)
     assert FilterConfig.from_yaml(file) == expected
-    lines = [line for line, _ in lines_of_use(tmp_path, ["other.bag"], parameters=True)]
+    lines = [line for line, _ in lines_of_use(tmp_path, ["other.bag"])]
     assert f"--config {file}" in lines[0] and f"--params-file {file}" in lines[2]
-    assert write_parameters(file, None, FilterConfig()) is None and not file.exists()
+
+
+def test_parameters_that_are_all_defaults_are_a_file_too(tmp_path):
+    """The printed command names it, and other files of the folder may be of another day."""
+    file = tmp_path / "ekf_node.yaml"
+    file.write_text("of another day")
+    assert write_parameters(file, None) == file
+    assert FilterConfig.from_yaml(file) == FilterConfig()
+    assert "# m; the default" in file.read_text()
 
 
 def test_without_inertial_samples_the_nodes_are_told_so(tmp_path):

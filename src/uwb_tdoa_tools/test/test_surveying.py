@@ -368,12 +368,10 @@ def test_survey_of_a_recording_of_ranges(ranged, by_ranges, solved, tmp_path, ca
     solved.result = by_ranges
     bag, out = tmp_path / "ranged.bag", tmp_path / "out"
     write_bag(ranged[0][0], bag)
-    out.mkdir()
-    (out / "ekf_node.yaml").write_text("of another day")
     assert main([str(bag), "--trusted", *TRUSTED, "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "wrote anchors.yaml, anchors.csv, effects.yaml, survey.json and survey.png" in said
-    assert not (out / "ekf_node.yaml").exists()
+    assert "wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json" in said
+    assert FilterConfig.from_yaml(out / "ekf_node.yaml") == FilterConfig()
     told = json.loads((out / "survey.json").read_text())
     delay, std = told["tag_delay"]
     assert (

@@ -103,12 +103,8 @@ class Calibration:
             f"{change and f' ({change})'} on {self.judged_on}"
         )
 
-    def save(
-        self, folder: Path, config: FilterConfig, has_imu: bool
-    ) -> tuple[Path | None, Path | None, Path | None]:
-        """Write anchors.yaml, effects.yaml and ekf_node.yaml; return their paths, or None.
-
-        There is no ekf_node.yaml if all parameters have their defaults; an earlier one is removed.
+    def save(self, folder: Path, config: FilterConfig, has_imu: bool) -> tuple[Path, Path, Path]:
+        """Write anchors.yaml, effects.yaml and ekf_node.yaml, and return their paths.
 
         config : FilterConfig of the calibration; has_imu : whether a recording has inertial samples
         """

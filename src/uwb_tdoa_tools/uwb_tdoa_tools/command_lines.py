@@ -152,28 +152,25 @@ def lines_of_use(
     recordings: Sequence[str | Path],
     survey: str | Path | None = None,
     anchors: str | Path | None = None,
-    parameters: bool = False,
     truth: bool = True,
     more: Iterable[str] = (),
 ) -> tuple[tuple[str, str], ...]:
-    """Return ((command line, purpose), ...) for the use of the effects.yaml in a folder.
+    """Return ((command line, purpose), ...) for the use of effects.yaml and ekf_node.yaml.
 
     Parameters
     ----------
     folder : Path
-        Folder with effects.yaml.
+        Folder with both files.
     recordings : sequence of paths
         Recordings to evaluate.
     survey, anchors : path or None
         Files of anchors for evaluate and for the nodes.
-    parameters : bool
-        Whether the folder holds an ekf_node.yaml.
     truth : bool
         Whether the recordings hold ground truth.
     more : iterable of str
         Further options of the line that evaluates.
     """
-    effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
+    effects, config = folder / "effects.yaml", folder / "ekf_node.yaml"
     bias, ekf = node_lines(anchors, effects, config)
     return (
         (

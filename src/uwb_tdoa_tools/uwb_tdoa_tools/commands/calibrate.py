@@ -156,7 +156,7 @@ def _calibrate(args: Namespace) -> int:
         )
         return _stop(made.why_not)
     files = made.save(out, config, has_imu([*flights, *holdout]))
-    written = ", ".join(file.name for file in files if file)
+    written = ", ".join(file.name for file in files)
     cli.show(f"wrote {written} and calibration.json to {out}")
     judging = command_lines.evaluate_line(judges or paths, *files, all(known), more)
     cli.show(f"judge it:   {judging}")

@@ -207,9 +207,7 @@ def _diagnose(args: Namespace) -> int:
 
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
-    parameters = write_parameters(
-        out / "ekf_node.yaml", result.tdoa_std, config, has_imu([*flights, *holdout])
-    )
+    write_parameters(out / "ekf_node.yaml", result.tdoa_std, config, has_imu([*flights, *holdout]))
     truth = all(flight.truth is not None for flight in holdout or flights)
     more = [*options.words_of_reading(args)]
     more += [word for sensor in reference.left_out for word in ("--without", sensor)]
@@ -219,7 +217,6 @@ def _diagnose(args: Namespace) -> int:
         args.holdout or args.flights,
         args.survey,
         its_survey,
-        parameters is not None,
         truth,
         more,
     )
@@ -234,11 +231,7 @@ def _diagnose(args: Namespace) -> int:
     for name, text in more_files.items():
         write_text(out / name, text)
     cli.show(output.as_text(result))
-    files = (
-        *("diagnosis.json", "effects.yaml"),
-        *["ekf_node.yaml"][: parameters is not None],
-        *more_files,
-    )
+    files = "diagnosis.json", "effects.yaml", "ekf_node.yaml", *more_files
     cli.show(f"wrote {', '.join(files)} and report.html to {out}")
     return 0
 

@@ -101,8 +101,8 @@ def _survey(args: Namespace) -> int:
     picture(result, out / "survey.png")
     cli.show(as_text(result))
     cli.show(
-        "wrote anchors.yaml, anchors.csv, effects.yaml, "
-        f"{'ekf_node.yaml, ' if config_file else ''}survey.json and survey.png to {out}"
+        "wrote anchors.yaml, anchors.csv, effects.yaml, ekf_node.yaml, survey.json and survey.png "
+        f"to {out}"
     )
     if result.why_not is None:
         files = out / "anchors.yaml", out / "effects.yaml", config_file

@@ -21,11 +21,11 @@ MEASURED = "m; measured: as many TDOAs count as independent as there are"
 
 def write_parameters(
     path: Path, tdoa_std: float | None, config: FilterConfig | None = None, has_imu: bool = True
-) -> Path | None:
-    """Write parameters of ekf_node, and return the path, or None if all have their defaults.
+) -> Path:
+    """Write parameters of ekf_node, and return the path.
 
-    The file holds every parameter that differs from the default, so that it alone makes the nodes
-    and `evaluate` run the filter that was judged. An earlier file is removed if there is none.
+    The file holds tdoa_std, and every parameter that differs from the default, so that it alone makes the
+    nodes and `evaluate` run the filter that was judged.
 
     path : of the file; tdoa_std : m, measured, or None
     config : FilterConfig with which tdoa_std was measured
@@ -39,14 +39,10 @@ def write_parameters(
         if value != getattr(default, name)
     }
     if tdoa_std is not None:
-        lines = {"tdoa_std": f"{tdoa_std:.{DECIMALS}f}  # {MEASURED}"} | {
-            name: line for name, line in lines.items() if name != "tdoa_std"
-        }
+        lines["tdoa_std"] = f"{tdoa_std:.{DECIMALS}f}  # {MEASURED}"
+    lines.setdefault("tdoa_std", f"{default.tdoa_std}  # m; the default")
     if not has_imu:
         lines["use_imu"] = f"false  # {NO_IMU}"
-    if not lines:
-        path.unlink(missing_ok=True)
-        return None
     write_text(path, HEAD + "".join(f"    {name}: {line}\n" for name, line in lines.items()))
     return path
 

@@ -87,7 +87,7 @@ def measured_noise(
     try:
         return tdoa_std_of(flights, effects, config, map_function)
     except InputError as error:
-        say(f"no ekf_node.yaml: {error}")
+        say(f"the noise of TDOAs is not measured: {error}")
         return None
 
 
