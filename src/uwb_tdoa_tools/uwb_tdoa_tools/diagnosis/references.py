@@ -108,13 +108,12 @@ class Reference:
         flight : for its name; poses : Truth, known or estimated
         """
         phase, first, last = scored_phase(poses)
-        first, last = first + MARGIN, last - MARGIN
-        if last - first < SHORTEST:
+        least = SHORTEST + 2.0 * MARGIN
+        if last - first < least:
             raise InputError(
-                f"{flight.name}: only {last - first:.1f} s of it are {TITLES[phase]}, without "
-                f"{MARGIN:g} s at both ends; {SHORTEST:g} s are needed."
+                f"{flight.name}: {TITLES[phase]}: only {last - first:.1f} s; {least:g} s are needed."
             )
-        return first, last
+        return first + MARGIN, last - MARGIN
 
 
 class GroundTruth(Reference):
