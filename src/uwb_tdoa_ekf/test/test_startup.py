@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core import initialization
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
@@ -574,6 +574,59 @@ def test_a_gyroscope_that_is_off_for_three_seconds_leaves_no_yaw_that_is_wrong_a
     flight = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro + off))
     odometry, _ = opened(Estimator(flight.anchors, told(flight, 0.0)), flight)
     assert not dishonest(flight, odometry)[odometry.t > 11.0 + SOON].any()
+
+
+class Race:
+    """A circuit at 11 m/s. Thrust is the only force, so the drone leans by up to 74 degrees."""
+
+    rates, far, step = np.array([1.94, 2.54]), 4.5, 1e-3  # rad/s, m, s
+
+    def motion(self, t):
+        """As of `Wave`: it starts at rest, and is fast after 3 s."""
+        t = np.asarray(t)
+        way = np.where(t < 3.0, 3.0 * ((t / 3.0) ** 3 - 0.5 * (t / 3.0) ** 4), t - 1.5)[:, None]
+        p = np.hstack([self.far * np.sin(self.rates * way), 1.5 + 0.0 * way])
+        return p, None, None, None, None
+
+    def fly(self, seed, duration=20.0, imu_rate=500.0, tdoa_rate=200.0):
+        """Return a Flight with its rates of `imu_rate`, and white noise of TDOAs of 0.1 m."""
+        rng, anchors = np.random.default_rng(seed), corners((14.0, 14.0, 3.0))
+        anchors = anchors.at(anchors.positions - [7.0, 7.0, 0.0])
+        t = np.arange(0.0, duration, self.step)
+        p = self.motion(t)[0]
+        force = np.gradient(np.gradient(p, t, axis=0), t, axis=0) + [0.0, 0.0, GRAVITY]
+        up = force / np.linalg.norm(force, axis=1)[:, None]
+        left = np.cross(up, [1.0, 0.0, 0.0])
+        left /= np.linalg.norm(left, axis=1)[:, None]
+        attitude = Rotation.from_matrix(np.stack([np.cross(left, up), left, up], axis=2))
+        turn = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / self.step
+        some = np.arange(0, len(turn), round(1.0 / (self.step * imu_rate)))
+        stamps = np.arange(0.02, duration - 0.1, 1.0 / tdoa_rate)
+        a = rng.integers(0, 8, len(stamps))
+        b = (a + rng.integers(1, 8, len(stamps))) % 8
+        places = anchors.positions
+        d = tdoa(self.motion(stamps)[0], places[a], places[b]) + 0.1 * rng.normal(size=len(a))
+        return Flight(
+            "race",
+            anchors,
+            Tdoas(stamps, anchors.ids[a], anchors.ids[b], d),
+            Imu(t[some], turn[some], attitude[some].inv().apply(force[some])),
+            Truth(t, p, attitude.as_quat()),
+        )
+
+
+@pytest.mark.parametrize("begin", [6.0, 7.0, 8.0, 9.0, 10.0])
+def test_a_drone_that_leans_is_found_again_after_its_gyroscope_has_failed(begin):
+    """It stayed lost for 4 to 12 s: a reset took its thrust for the vertical, and was sure of that."""
+    found = []
+    for seed in range(3):
+        flight = Race().fly(seed)
+        off = ((flight.imu.t > begin) & (flight.imu.t < begin + 0.6))[:, None]
+        gyro = np.where(off, 0.0, flight.imu.gyro)
+        odometry = run_offline(replace(flight, imu=replace(flight.imu, gyro=gyro))).odometry
+        away = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
+        found.append(odometry.t[away > 1.0].max() - begin)
+    assert np.median(found) < 4.2
 
 
 def test_it_depends_on_stamps_alone_and_the_smoother_goes_on():

@@ -35,6 +35,9 @@ CLEARLY_MORE = 0.2  # share of TDOAs by which a recovery must exceed the filter
 # s of TDOAs for a recovery, and over which the share of TDOAs that agree with the filter is averaged.
 # It is short, because a tag that leaves the floor must not wait until TDOAs of the floor have left it.
 RECOVERY_WINDOW = 0.3
+# s, and TDOAs in it from which on these alone serve a recovery: a drone that races changes its velocity
+# by 10 m/s in RECOVERY_WINDOW
+SHORT_WINDOW, ENOUGH = (0.12, 20)
 SLOW_TDOAS, SLOW_STAMPS = (20, 3)  # TDOAs and stamps of a start if few TDOAs come
 # s; older TDOAs do not show where the tag is. After so long without one, a tag that may be anywhere
 # in its workspace is lost: the filter stops, then starts again
@@ -49,6 +52,9 @@ LONGEST_GAP = 0.6
 # second a rover has 0.13 m, with 5 0.30 m, and 0.19 m without its wheels
 YAW_SECONDS, FEWEST_OF_YAW = (2.0, 12)
 TILT_STD = 0.1  # rad, roll and pitch at the start
+RESET_TILT_STD = (
+    0.5  # rad, the same after a reset in flight: a drone that leans feels its thrust alone
+)
 # rad, standard deviation with which hypotheses of all yaws start, with nearly the same weight
 YAW_SEARCH_STD = 2.0 * math.pi
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
@@ -57,8 +63,9 @@ SMALLEST_STD = 0.03  # m, least standard deviation of a known height at the star
 # agreed
 REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
 # s for which TDOAs must agree on a place that the IMU cannot have led to, and s between two openings of
-# the yaw: then the IMU is wrong. In 22 measured flights TDOAs contradict for 0.5 s at most.
-IMU_CONTRADICTED, TWICE = (2.0, 20.0)
+# the yaw: then the IMU is wrong. In 22 measured flights TDOAs contradict for 0.5 s at most. A second
+# recovery within AGAIN s shows that the attitude is wrong.
+IMU_CONTRADICTED, TWICE, AGAIN = (1.0, 20.0, 2.0)
 # number of late anchors that may explain TDOAs that contradict wheels: two late anchors are as
 # probable as a rover that jumps
 LATE_ANCHORS = 2
@@ -489,7 +496,9 @@ def _begin(
     x, covariance, cost = places.x, places.covariance, places.cost
     if ekf.first_best < 0 and ekf.last_agreement > -np.inf:
         ekf.first_best = ekf.best
-    accel = _mean_accel(ekf.imu, parameters)
+    accel, tilt_std = _mean_accel(ekf.imu, parameters), TILT_STD
+    if ekf.running:
+        accel[:], tilt_std = ekf.imu_fault_detector.up, RESET_TILT_STD
     unknown = steered and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
@@ -505,7 +514,7 @@ def _begin(
         P = hypothesis.P
         P[:] = 0.0
         hypotheses.set_state(hypothesis, x[place], covariance[place])
-        P[6, 6] = P[7, 7] = TILT_STD**2
+        P[6, 6] = P[7, 7] = tilt_std**2
         P[8, 8] = min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW) ** 2
         for k in range(3):
             P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
@@ -530,9 +539,9 @@ def recover(
     """Move the filter to another position if the TDOAs of the window agree on it.
 
     The window must agree on the position clearly better than on the position of the filter.
-    Attitude and biases stay the same. A tag with a sound inertial sensor, or with wheels, does not
-    jump. So its recovery is limited to the distance that it can have moved since the filter agreed
-    with TDOAs.
+    Attitude and biases stay the same, unless an IMU has led to the wrong place. A tag with a sound
+    inertial sensor, or with wheels, does not jump. So its recovery is limited to the distance that
+    it can have moved since the filter agreed with TDOAs.
 
     Parameters
     ----------
@@ -549,7 +558,9 @@ def recover(
     history : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
+    window = recent(ekf, SHORT_WINDOW)
+    if len(window) < ENOUGH:
+        window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + CHECK_PERIOD
@@ -592,6 +603,7 @@ def recover(
     if lost:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     else:
+        felt = felt or (ekf.sensed and t - ekf.recovered < AGAIN)
         ekf.recovered = t
         if felt:  # what led to a wrong place has spoiled velocity, attitude and biases, too
             open_yaw(ekf, parameters, history)
