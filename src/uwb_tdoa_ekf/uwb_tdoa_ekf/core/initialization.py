@@ -65,7 +65,9 @@ REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
 # s for which TDOAs must agree on a place that the IMU cannot have led to, and s between two openings of
 # the yaw: then the IMU is wrong. In 22 measured flights TDOAs contradict for 0.5 s at most. A second
 # recovery within AGAIN s shows that the attitude is wrong.
-IMU_CONTRADICTED, TWICE, AGAIN = (1.0, 20.0, 2.0)
+IMU_CONTRADICTED, TWICE, AGAIN = (2.0, 20.0, 1.0)
+# s, instead of IMU_CONTRADICTED, if the tag moves otherwise there, m/s: TDOAs that jump do not show this
+RUNS_AWAY, OTHER_MOTION = (1.0, 3.0)
 # number of late anchors that may explain TDOAs that contradict wheels: two late anchors are as
 # probable as a rover that jumps
 LATE_ANCHORS = 2
@@ -586,9 +588,11 @@ def recover(
     )
     if not lost and wheels and _outweighs(ekf, anchors, window, x[0], t):
         return
-    away = math.sqrt(np.sum((x[0, :3] - ekf.hypotheses[ekf.best].x[:3]) ** 2))
+    offset = (x[0, :6] - ekf.hypotheses[ekf.best].x[:6]) ** 2
+    away, faster = math.sqrt(np.sum(offset[:3])), math.sqrt(np.sum(offset[3:]))
     if not lost and (felt or wheels) and away > reach(ekf, t):
-        if felt and t - ekf.last_agreement > IMU_CONTRADICTED:
+        contradicted = RUNS_AWAY if faster > OTHER_MOTION else IMU_CONTRADICTED
+        if felt and t - ekf.last_agreement > contradicted:
             _leave_imu_out(ekf, t, away)
         return
     for h in range(HYPOTHESES):
@@ -603,8 +607,8 @@ def recover(
     if lost:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     else:
-        felt = felt or (ekf.sensed and t - ekf.recovered < AGAIN)
-        ekf.recovered = t
+        felt = felt or (ekf.sensed and t - ekf.relocated < AGAIN)
+        ekf.relocated = ekf.recovered = t
         if felt:  # what led to a wrong place has spoiled velocity, attitude and biases, too
             open_yaw(ekf, parameters, history)
     ekf.consistency, ekf.late_as_known = 1.0, False

@@ -315,7 +315,8 @@ EKF = _record(
     # best hypothesis when the yaws were opened anew for the first time; -1: they were not
     ("first_best", int),
     ("recoveries", int),  # number of recoveries
-    ("recovered", float),  # s, stamp of the last recovery from a contradiction
+    ("relocated", float),  # s, stamp of the last recovery from a contradiction
+    ("recovered", float),  # s, the same, or the last stamp at which its yaw was not found yet
     ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
     ("last_tdoa", float),  # s, stamp of the last TDOA or range
     ("next_search", float),  # s, stamp of the next search
@@ -420,6 +421,7 @@ NEVER = (
     "next_look",
     "next_workspace",
     "next_floor",
+    "relocated",
     "recovered",
     "last_agreement",
     "position_unknown_until",
