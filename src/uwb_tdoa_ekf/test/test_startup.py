@@ -442,6 +442,14 @@ def test_turning_the_world_turns_the_estimate():
     np.testing.assert_allclose(other.p[late], turn.apply(one.p[late]), atol=0.02)
 
 
+@pytest.mark.parametrize(("rate", "seed"), [(2.0, 6), (2.0, 7), (3.0, 6), (5.0, 5)])
+def test_a_tag_whose_imu_never_comes_is_not_at_rest(rate, seed):
+    """An IMU that was never heard counted as quiet: `use_imu` is true by default."""
+    flight = replace(fly(seed, 30.0, tdoa_rate=rate), imu=None)
+    ours, without = (run_offline(flight, FilterConfig(use_imu=use)) for use in (True, False))
+    np.testing.assert_allclose(ours.odometry.p, without.odometry.p, atol=1e-6)
+
+
 def test_a_slow_start_needs_a_tdoa():
     """Before the first TDOA, as if a range comes first, nothing is read from the empty window."""
     state = new_state(np.eye(4, 3))

@@ -244,7 +244,8 @@ def start_slowly(
     if not (enough or (share >= AGREE and admitted)):
         return
     x, covariance = places.x[0].copy(), places.covariance[0].copy()
-    stands = parameters.zero_velocity and parameters.use_imu and inertial.is_quiet(ekf.imu)
+    sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout
+    stands = parameters.zero_velocity and sensed and inertial.is_quiet(ekf.imu)
     if stands:
         pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
         known = _known_height(ekf, parameters, t)
