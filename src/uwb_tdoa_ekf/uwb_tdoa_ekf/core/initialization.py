@@ -35,9 +35,9 @@ CLEARLY_MORE = 0.2  # share of TDOAs by which a recovery must exceed the filter
 # s of TDOAs for a recovery, and over which the share of TDOAs that agree with the filter is averaged.
 # It is short, because a tag that leaves the floor must not wait until TDOAs of the floor have left it.
 RECOVERY_WINDOW = 0.3
-# s, and TDOAs in it from which on these alone serve a recovery: a drone that races changes its velocity
-# by 10 m/s in RECOVERY_WINDOW
-SHORT_WINDOW, ENOUGH = (0.12, 20)
+# s: the window of a recovery if ENOUGH TDOAs are in it, because a drone that races changes its velocity
+# by 10 m/s in RECOVERY_WINDOW; and the window if few TDOAs come
+SHORT_WINDOW, ENOUGH, LONG_WINDOW = (0.12, 20, 0.7)
 SLOW_TDOAS, SLOW_STAMPS = (20, 3)  # TDOAs and stamps of a start if few TDOAs come
 # s; older TDOAs do not show where the tag is. After so long without one, a tag that may be anywhere
 # in its workspace is lost: the filter stops, then starts again
@@ -561,9 +561,7 @@ def recover(
     history : (n,) RECORD
         History for the smoother; empty for no recording.
     """
-    window = recent(ekf, SHORT_WINDOW)
-    if len(window) < ENOUGH:
-        window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
+    window = _window_of_recovery(ekf, parameters)
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + CHECK_PERIOD
@@ -616,6 +614,15 @@ def recover(
     ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def _window_of_recovery(ekf: Record, parameters: Record) -> np.ndarray:
+    """Return the shortest window with TDOAs enough for a recovery, (n,) TDOA."""
+    window = recent(ekf, SHORT_WINDOW)
+    if len(window) < ENOUGH:
+        window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
+    return window if len(window) >= MINIMUM else recent(ekf, LONG_WINDOW)
 
 
 @compiled
