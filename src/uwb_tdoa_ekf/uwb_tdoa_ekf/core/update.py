@@ -41,7 +41,7 @@ INNOVATION = np.dtype(
         ("entries", np.int64),  # number of entries
         ("value", float),  # measured minus predicted
         ("noise_variance", float),  # of a single measurement
-        ("prior_variance", float),  # h P h', plus curvature
+        ("prior_variance", float),  # h P h', plus curvature if the update adds it
         # variance of the second-order term of a TDOA within P, see `second_order_variance`
         ("curvature", float),
         # P h', covariance of error state and prediction; the gain is this over total_variance
@@ -233,15 +233,15 @@ def _weigh_by_m_estimation(hypothesis: Record, innovation: Record, parameters: R
     loss = parameters.loss
     e[:] = 0.0  # scaled error of the state, eq. 9
     for _ in range(parameters.iterations):
-        left, total = innovation.value, 0.0
+        left, total = innovation.value, innovation.prior_variance
         for k in range(columns):
             left -= y[k] * e[k]
             w[k] = weight(loss, e[k], parameters.state_scale)
-            total += y[k] * y[k] / w[k]
+            total += y[k] * y[k] * (1.0 / w[k] - 1.0)
         of_noise = max(
             weight(loss, left / math.sqrt(noise), parameters.measurement_scale), SMALLEST_WEIGHT
         )
-        total += noise / of_noise + innovation.curvature
+        total += noise / of_noise
         for k in range(columns):
             e[k] = y[k] / w[k] * (innovation.value / total)
     _weigh_prior(hypothesis, innovation, rows, columns)
