@@ -4,13 +4,24 @@
 from dataclasses import replace
 
 from covariances import assert_covariance
-from flights import WORKSPACE, corners, errors_of, fly, kept, leaving, with_ranges, without_tdoas
+from flights import (
+    WORKSPACE,
+    corners,
+    errors_of,
+    fly,
+    kept,
+    leaving,
+    position_at,
+    with_ranges,
+    without_tdoas,
+)
 from hypothesis import given, settings, strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf import smoother
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
@@ -126,6 +137,25 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
         nees.append(errors_of(flight, middle)[1].mean())
     # The path is a wave, unlike white acceleration.
     assert 2.0 < np.mean(nees) < (4.0 if use_imu else 6.0)
+
+
+def test_it_is_not_too_certain_beside_a_line_of_anchors(monkeypatch):
+    """TDOAs of a line do not show the angle about it. The smoother took the circle for its tangent."""
+
+    def nees():
+        out, line = [], np.linspace([0.0, 1.0, 3.0], [7.0, 6.0, 3.0], 8)
+        for seed in range(5):
+            flight = fly(seed, 40.0, tdoa_rate=100.0, **NOISE)
+            tdoas, rng = flight.tdoa, np.random.default_rng(seed)
+            a, b = (line[flight.anchors.index(ids)] for ids in (tdoas.a, tdoas.b))
+            d = tdoa(position_at(flight, tdoas.t), a, b) + 0.1 * rng.normal(size=len(tdoas))
+            flight = replace(flight, anchors=flight.anchors.at(line), tdoa=replace(tdoas, d=d))
+            out.append(errors_of(flight, smooth(flight).odometry, 5.0)[1].mean() / 3.0)
+        return np.median(out)
+
+    assert nees() < 3.0
+    monkeypatch.setattr(smoother, "_with_curvature", lambda smoothed, *_: smoothed)
+    assert nees() > 5.0
 
 
 def test_its_covariance_holds_errors_that_do_not_average_out():

@@ -220,7 +220,8 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
     if config.planar:
         plane.flatten_all(smoothed, config.parameters())
     odometry = _with_persistent(Odometry.from_rows(smoothed), result.odometry)
-    return replace(result, odometry=odometry)
+    places = flight.anchors.positions
+    return replace(result, odometry=_with_curvature(odometry, result.odometry, places))
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
@@ -231,12 +232,40 @@ def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
     """
     if not len(online):
         return smoothed
-    consider_covariance = online.consider_covariance[
-        np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)
-    ]
+    consider_covariance = online.consider_covariance[_last(online, smoothed)]
     covariance = smoothed.covariance.copy()
     covariance[:, :3, :3] += consider_covariance
     return replace(smoothed, covariance=covariance, consider_covariance=consider_covariance)
+
+
+def _with_curvature(smoothed: Odometry, online: Odometry, anchors: np.ndarray) -> Odometry:
+    """Return the smoothed Odometry with a covariance nearer to the online one where TDOAs are curved.
+
+    The smoother takes TDOAs for linear. A position with the deviation s, at the distance r from the
+    anchors, is off its linearized TDOAs by about s^2 / (2 r). The squared ratio of that to s is the
+    share of the online covariance. It is nothing where the position is known to a metre.
+
+    Parameters
+    ----------
+    smoothed, online : Odometry
+        Estimates of the smoother and of the filter.
+    anchors : (N, 3) array
+        Positions, in m.
+    """
+    if not len(online):
+        return smoothed
+    last, middle = _last(online, smoothed), anchors.mean(axis=0)
+    P, extent = online.covariance[last, :3, :3], np.sum(anchors.var(axis=0))
+    squared = np.sum((online.p[last] - middle) ** 2, axis=1) + extent
+    share = np.minimum(np.trace(P, axis1=1, axis2=2) / (4.0 * squared), 1.0)[:, None, None]
+    covariance = smoothed.covariance.copy()
+    covariance[:, :3, :3] += share * (P - covariance[:, :3, :3])
+    return replace(smoothed, covariance=covariance)
+
+
+def _last(online: Odometry, smoothed: Odometry) -> np.ndarray:
+    """Return the place of the last online estimate before each smoothed one, (n,) int."""
+    return np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)
 
 
 def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
