@@ -52,9 +52,8 @@ LONGEST_GAP = 0.6
 # second a rover has 0.13 m, with 5 0.30 m, and 0.19 m without its wheels
 YAW_SECONDS, FEWEST_OF_YAW = (2.0, 12)
 TILT_STD = 0.1  # rad, roll and pitch at the start
-RESET_TILT_STD = (
-    0.5  # rad, the same after a reset in flight: a drone that leans feels its thrust alone
-)
+# rad, the same after a reset in flight: a drone that leans feels its thrust alone
+RESET_TILT_STD = 0.5
 # rad, standard deviation with which hypotheses of all yaws start, with nearly the same weight
 YAW_SEARCH_STD = 2.0 * math.pi
 WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
