@@ -41,6 +41,7 @@ from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.verdict import verdict
 from uwb_tdoa_tools.diagnosis.validation import ValidatedSelection
+from uwb_tdoa_tools.flying import demo
 
 # --- diagnose ---
 
@@ -530,3 +531,13 @@ def test_an_obstacle_at_a_place_does_not_switch():
     blocked = EFFECTS["nlos"](place).inject(flight)
     (found,), named = repairing.without_switching([blocked], GroundTruth(), EffectSet())
     assert found is blocked and not named
+
+
+@pytest.mark.slow
+def test_an_obstacle_that_a_flight_seldom_returns_to_is_told_by_another_flight(tmp_path):
+    """The first flight alone takes it for an anchor that switches: then nothing was corrected."""
+    flights = demo.read(demo.record(3, tmp_path)[:2])
+    (found,), named = repairing.without_switching(flights[:1], GroundTruth(), EffectSet())
+    assert found is not flights[0] and named
+    found, named = repairing.without_switching(flights, GroundTruth(), EffectSet())
+    assert list(found) == list(flights) and not named

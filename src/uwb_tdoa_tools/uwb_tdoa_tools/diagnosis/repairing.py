@@ -76,24 +76,25 @@ def without_switching(
     not have it, but it hides what they have. It is taken out if that improves the
     filter in this flight.
     """
-    out, found = [], []
-    for flight, residuals in zip(flights, residuals_of(flights, reference, base, progress)):
-        table, less = table_of([residuals]), flight  # sparse: with many anchors
-        if switch := [
-            one for part in table.tdoa_parts if not table.sparse for one in switching(part)
-        ]:
-            table = table.with_terms([one.terms[0] for one in switch])
-            inflation = fit(table, columns_of(switch), covariance=False).inflation
-            selection = select(table, [], inflation, start=switch)
-            for effect in effects_of(selection):
-                # The level, c0, is a delay, which other flights have too.
-                values = {k: -v for k, v in effect.values.items() if not k.endswith("c0")}
-                less = replace(effect, values=values).inject(less)
-            errors = [_error([one], base.effects, config, progress) for one in (flight, less)]
-            if errors[1] < errors[0] * (1.0 - WORSE):
-                found.append((flight.name, selection))
-                flight = less
-        out.append(flight)
+    out, found = list(flights), []
+    tables = [table_of([one]) for one in residuals_of(flights, reference, base, progress)]
+    # sparse: with many anchors
+    some = [k for k, table in enumerate(tables) if table.tdoa_parts and not table.sparse]
+    several = switching([part for k in some for part in tables[k].tdoa_parts])
+    for k, switch in zip(some, several):
+        if not switch:
+            continue
+        table, less = tables[k].with_terms([one.terms[0] for one in switch]), flights[k]
+        inflation = fit(table, columns_of(switch), covariance=False).inflation
+        selection = select(table, [], inflation, start=switch)
+        for effect in effects_of(selection):
+            # The level, c0, is a delay, which other flights have too.
+            values = {key: -v for key, v in effect.values.items() if not key.endswith("c0")}
+            less = replace(effect, values=values).inject(less)
+        errors = [_error([one], base.effects, config, progress) for one in (flights[k], less)]
+        if errors[1] < errors[0] * (1.0 - WORSE):
+            found.append((less.name, selection))
+            out[k] = less
     return tuple(out), tuple(found)
 
 

@@ -79,15 +79,37 @@ class NlosDetector(Detector):
         return out
 
 
-def switching(part: TdoaResidual) -> list[Candidate]:
-    """Return a Candidate of each anchor that switches between two levels at times of its own.
+def switching(parts: Sequence[TdoaResidual]) -> list[list[Candidate]]:
+    """Return, for each flight, a Candidate of each anchor that switches between two levels.
 
-    The level follows neither the place nor the direction in the tag, as far as the flight returns
-    there.
+    It does so at times of its own: the level follows neither the place nor the direction in the
+    tag, as far as the flights return there.
 
-    part : residual of TDOAs of a single flight
+    parts : residuals of TDOAs, of one flight each, with the same anchors
     """
-    samples, out = part.samples, []
+    several, out = [_levels(part) for part in parts], []
+    for levels in several:
+        found = []
+        for row, (term, gap, *_) in levels.items():
+            told = [other[row][2:] for other in several if row in other]
+            above, place, direction = map(np.concatenate, zip(*told))
+            if (
+                _agreement(above, place, gap) < OF_PLACE
+                and _agreement(above, direction, gap) < OF_DIRECTION
+            ):
+                found.append(Candidate((term,)))
+        out.append(found)
+    return out
+
+
+def _levels(
+    part: TdoaResidual,
+) -> dict[int, tuple[Term, float, np.ndarray, np.ndarray, np.ndarray]]:
+    """Return {anchor: (Term, gap, levels (b,), places (b, 3), directions (b, 3))} of two levels.
+
+    gap : as of `_agreement`; places and directions are in units of what counts as near
+    """
+    samples, out = part.samples, {}
     t, n = samples.t[part.fitted], len(samples.anchors)
     begin, step = t.min() - samples.start, max(STEP, OF_EACH * n * np.ptp(t) / len(t))
     at = ((t - t.min()) / step).astype(int)
@@ -105,19 +127,18 @@ def switching(part: TdoaResidual) -> list[Candidate]:
         best = int(np.argmax(between))
         above = median_filter(1 * (x > 0.5 * (low[best] + high[best])), 3, mode="nearest")
         switches = heard[np.flatnonzero(np.diff(above, prepend=0))]
-        away = attitude[heard].apply(samples.anchors.positions[row] - place[heard], inverse=True)
         if (
             high[best] - low[best] > APART * np.sqrt(max(np.var(x) - between[best], 0.0))
             and len(switches) >= LEAST_SWITCHES
             and RARE < above.mean() < 1.0 - RARE
-            and _agreement(above, place[heard] / NEAR, gap) < OF_PLACE
-            and _agreement(above, away / np.linalg.norm(away, axis=1)[:, None] / ALIKE, gap)
-            < OF_DIRECTION
         ):
+            anchor = samples.anchors.positions[row]
+            away = attitude[heard].apply(anchor - place[heard], inverse=True)
+            away /= np.linalg.norm(away, axis=1)[:, None]
             knots = tuple((begin + step * np.array([-1, *switches, len(late)])).tolist())
             term = SmoothTerm(covariate="time", form="anchor", knots=knots, shape="switching")
             keys = term.keys_of((str(samples.anchors.ids[row]),))
-            out.append(Candidate((Term(term, keys),)))
+            out[row] = Term(term, keys), gap, above, place[heard] / NEAR, away / ALIKE
     return out
 
 
