@@ -606,19 +606,18 @@ class Race:
 
     rates, far, step = np.array([1.94, 2.54]), 4.5, 1e-3  # rad/s, m, s
 
-    def motion(self, t):
-        """As of `Wave`: it starts at rest, and is fast after 3 s."""
+    def position(self, t):
+        """Return positions (n, 3), in m, at stamps t: it starts at rest, and is fast after 3 s."""
         t = np.asarray(t)
         way = np.where(t < 3.0, 3.0 * ((t / 3.0) ** 3 - 0.5 * (t / 3.0) ** 4), t - 1.5)[:, None]
-        p = np.hstack([self.far * np.sin(self.rates * way), 1.5 + 0.0 * way])
-        return p, None, None, None, None
+        return np.hstack([self.far * np.sin(self.rates * way), 1.5 + 0.0 * way])
 
     def fly(self, seed, duration=20.0, imu_rate=500.0, tdoa_rate=200.0):
-        """Return a Flight with its rates of `imu_rate`, and white noise of TDOAs of 0.1 m."""
+        """Return a Flight with white noise of TDOAs of 0.1 m; rates in 1/s."""
         rng, anchors = np.random.default_rng(seed), corners((14.0, 14.0, 3.0))
         anchors = anchors.at(anchors.positions - [7.0, 7.0, 0.0])
         t = np.arange(0.0, duration, self.step)
-        p = self.motion(t)[0]
+        p = self.position(t)
         force = np.gradient(np.gradient(p, t, axis=0), t, axis=0) + [0.0, 0.0, GRAVITY]
         up = force / np.linalg.norm(force, axis=1)[:, None]
         left = np.cross(up, [1.0, 0.0, 0.0])
@@ -630,7 +629,7 @@ class Race:
         a = rng.integers(0, 8, len(stamps))
         b = (a + rng.integers(1, 8, len(stamps))) % 8
         places = anchors.positions
-        d = tdoa(self.motion(stamps)[0], places[a], places[b]) + 0.1 * rng.normal(size=len(a))
+        d = tdoa(self.position(stamps), places[a], places[b]) + 0.1 * rng.normal(size=len(a))
         return Flight(
             "race",
             anchors,

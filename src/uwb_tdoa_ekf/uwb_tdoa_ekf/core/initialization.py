@@ -65,7 +65,8 @@ REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
 # the yaw: then the IMU is wrong. In 22 measured flights TDOAs contradict for 0.5 s at most. A second
 # recovery within AGAIN s shows that the attitude is wrong.
 IMU_CONTRADICTED, TWICE, AGAIN = (2.0, 20.0, 1.0)
-# s, instead of IMU_CONTRADICTED, if the tag moves otherwise there, m/s: TDOAs that jump do not show this
+# s, instead of IMU_CONTRADICTED, if the velocity there differs by OTHER_MOTION, m/s: that of TDOAs that
+# jump does not
 RUNS_AWAY, OTHER_MOTION = (1.0, 3.0)
 # number of late anchors that may explain TDOAs that contradict wheels: two late anchors are as
 # probable as a rover that jumps
@@ -499,7 +500,7 @@ def _begin(
     if ekf.first_best < 0 and ekf.last_agreement > -np.inf:
         ekf.first_best = ekf.best
     accel, tilt_std = _mean_accel(ekf.imu, parameters), TILT_STD
-    if ekf.running:
+    if ekf.running and parameters.use_imu:
         accel[:], tilt_std = ekf.imu_fault_detector.up, RESET_TILT_STD
     unknown = steered and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -87,29 +88,45 @@ def switching(parts: Sequence[TdoaResidual]) -> list[list[Candidate]]:
 
     parts : residuals of TDOAs, of one flight each, with the same anchors
     """
-    several, out = [_levels(part) for part in parts], []
-    for levels in several:
-        found = []
-        for row, (term, gap, *_) in levels.items():
-            told = [other[row][2:] for other in several if row in other]
-            above, place, direction = map(np.concatenate, zip(*told))
-            if (
-                _agreement(above, place, gap) < OF_PLACE
-                and _agreement(above, direction, gap) < OF_DIRECTION
-            ):
-                found.append(Candidate((term,)))
-        out.append(found)
-    return out
+    several = [_levels(part) for part in parts]
+    own = set[int]()  # anchors whose levels follow nothing that flights share
+    for row in set[int]().union(*several):
+        told = [levels[row] for levels in several if row in levels]
+        gap = max(one.gap for one in told)
+        above, place, direction = (
+            np.concatenate([getattr(one, name) for one in told])
+            for name in ("above", "place", "direction")
+        )
+        if (
+            _agreement(above, place, gap) < OF_PLACE
+            and _agreement(above, direction, gap) < OF_DIRECTION
+        ):
+            own.add(row)
+    return [
+        [Candidate((one.term,)) for row, one in levels.items() if row in own] for levels in several
+    ]
 
 
-def _levels(
-    part: TdoaResidual,
-) -> dict[int, tuple[Term, float, np.ndarray, np.ndarray, np.ndarray]]:
-    """Return {anchor: (Term, gap, levels (b,), places (b, 3), directions (b, 3))} of two levels.
+class _Levels(NamedTuple):
+    """The two levels of an anchor in a flight.
 
-    gap : as of `_agreement`; places and directions are in units of what counts as near
+    term : the function of the time; gap : as of `_agreement`
+    above : (b,) 0 or 1; place, direction : (b, 3) in units of what counts as near
     """
-    samples, out = part.samples, {}
+
+    term: Term
+    gap: float
+    above: np.ndarray
+    place: np.ndarray
+    direction: np.ndarray
+
+
+def _levels(part: TdoaResidual) -> dict[int, _Levels]:
+    """Return {row of an anchor: its _Levels} of the anchors with two levels of lateness.
+
+    part : residual of TDOAs of a single flight
+    """
+    samples, out = part.samples, dict[int, _Levels]()
     t, n = samples.t[part.fitted], len(samples.anchors)
     begin, step = t.min() - samples.start, max(STEP, OF_EACH * n * np.ptp(t) / len(t))
     at = ((t - t.min()) / step).astype(int)
@@ -118,7 +135,7 @@ def _levels(
     place, turned = (value[part.fitted][first] for value in (samples.p, samples.q))
     known = np.linalg.norm(turned, axis=1)[:, None] > 0.5
     attitude = Rotation.from_quat(np.where(known, turned, [0.0, 0.0, 0.0, 1.0]))
-    for row in np.flatnonzero(np.isfinite(late).sum(axis=0) > LEAST_SWITCHES):
+    for row in np.flatnonzero(np.isfinite(late).sum(axis=0) > LEAST_SWITCHES).tolist():
         heard = np.flatnonzero(np.isfinite(late[:, row]))
         x, count = late[heard, row], np.arange(1, len(heard))
         level = np.sort(x).cumsum()
@@ -138,7 +155,7 @@ def _levels(
             knots = tuple((begin + step * np.array([-1, *switches, len(late)])).tolist())
             term = SmoothTerm(covariate="time", form="anchor", knots=knots, shape="switching")
             keys = term.keys_of((str(samples.anchors.ids[row]),))
-            out[row] = Term(term, keys), gap, above, place[heard] / NEAR, away / ALIKE
+            out[row] = _Levels(Term(term, keys), gap, above, place[heard] / NEAR, away / ALIKE)
     return out
 
 
