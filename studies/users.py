@@ -4,7 +4,8 @@
 
 The recordings come from a simulator in this file. Two textbook estimators run beside the filter: an
 extended Kalman filter with constant velocity, and batch least squares over the whole recording.
-Both know the noise of the TDOAs and the density of the random acceleration. The filter has its defaults.
+Both know the noise of the TDOAs and the density of the random acceleration, and both bound what a TDOA
+beyond GATE deviations does. The filter has its defaults.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from . import table
 DURATION, SETTLED = 40.0, 5.0  # s; errors count from SETTLED on
 BEGIN = 3.0  # s until the tag has its speed
 NOISE, DELAY, SURVEY = 0.1, 0.08, 0.05  # m
+GATE = 3.0  # standard deviations up to which the textbook estimators believe a TDOA
+OUTLIERS, LATE = 0.05, 2.0  # share of outliers, and their mean size (m), exponential
 REFLECTION, CHANGES = 0.12, 0.5  # m; a reflection changes over this length
 STEP = 0.5  # m between two estimates that the motion does not explain
 KNOT = 0.1  # s between positions of the batch least squares
@@ -67,7 +70,7 @@ BODIES = {
 }
 # errors of anchors; and anchors on one line that is no axis, anchors of the ceiling alone, rates beyond
 # the range of the gyroscope, a height that is fixed, for a lift wrongly
-ERRORS = "white", "delays", "survey", "reflections"
+ERRORS = "white", "delays", "survey", "reflections", "outliers"
 LINE, CEILING, CLIPPED, FIXED = "oblique line", "ceiling", "clipped gyroscope", "fixed height"
 # anchors of a hall of 40 x 30 m and of a tunnel of 60 x 4 m, of which the tag hears the nearest eight;
 # wheels that measure velocity and yaw rate; an IMU with a tenth of the noise
@@ -91,9 +94,13 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("person", 0, 2, "white"),
     ("person", 0, 5, "reflections"),
     ("person", 0, 10, "delays"),
+    ("person", 0, 2, "outliers"),
+    ("person", 0, 5, "outliers"),
+    ("person", 0, 10, "outliers"),
     ("person", 0, 50, "survey"),
     ("person", 0, 200, "reflections"),
     ("person", 100, 10, "white"),
+    ("person", 100, 10, "outliers"),
     ("person", 100, 50, "reflections"),
     ("runner", 0, 5, "white"),
     ("runner", 0, 10, "delays"),
@@ -101,6 +108,7 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("runner", 0, 20, "reflections"),
     ("runner", 100, 20, "survey"),
     ("rover", 0, 5, "white"),
+    ("rover", 0, 5, "outliers"),
     ("rover", 0, 20, "reflections"),
     ("rover", 0, 200, "delays"),
     ("rover", 100, 5, "delays"),
@@ -108,6 +116,7 @@ CELLS = [  # body, IMU (Hz), TDOAs/s, errors
     ("rover", 100, 200, "white"),
     ("quadrotor", 500, 5, "white"),
     ("quadrotor", 500, 20, "delays"),
+    ("quadrotor", 500, 20, "outliers"),
     ("quadrotor", 500, 50, "white"),
     ("quadrotor", 100, 200, "survey"),
     ("quadrotor", 500, 400, "reflections"),
@@ -218,7 +227,11 @@ def _tdoas(path: Any, places: np.ndarray, rate: float, errors: str, rng: Any) ->
             REFLECTION * np.mean(np.cos(np.einsum("nk,awk->naw", p, waves) + phases), 2) * 40**0.5
         )
     rows = np.arange(len(t))
-    return Tdoas(t, a, b, arrival[rows, b] - arrival[rows, a] + NOISE * rng.normal(size=len(t)))
+    d = arrival[rows, b] - arrival[rows, a] + NOISE * rng.normal(size=len(t))
+    if errors == "outliers":
+        size = rng.exponential(LATE, len(t)) * rng.choice([-1.0, 1.0], len(t))
+        d += size * (rng.random(len(t)) < OUTLIERS)
+    return Tdoas(t, a, b, d)
 
 
 def _wheels(t: np.ndarray, v: np.ndarray, q: Rotation, rng: Any) -> Velocity:
@@ -280,7 +293,9 @@ def kalman(
         for _ in range(5):  # iterated: linearized anew at the updated position
             r, H = _geometry(flight, np.array([k]), x[None, :3])
             h = np.append(H[0], np.zeros(3))
-            gain = P @ h / (h @ P @ h + NOISE**2)
+            variance = h @ P @ h + NOISE**2
+            variance = max(variance, abs(r[0] + h @ (x - prior)) / GATE * math.sqrt(variance))
+            gain = P @ h / variance
             x = prior + gain * (r + h @ (x - prior))
         P = P - np.outer(gain, h @ P)
         places[k], covariances[k] = x[:3], P[:3, :3]
@@ -313,8 +328,9 @@ def least_squares(
     for _ in range(8):
         r, H = _geometry(flight, rows, at @ p)
         J = sparse.hstack([sparse.diags(H[:, k]) @ at for k in range(3)]).tocsr()
-        system = J.T @ J / NOISE**2 + prior
-        right = J.T @ r / NOISE**2 - prior @ (p - level).T.ravel()
+        weighted = J.T @ sparse.diags(1.0 / np.maximum(NOISE**2, NOISE * np.abs(r) / GATE))
+        system = weighted @ J + prior
+        right = weighted @ r - prior @ (p - level).T.ravel()
         p += splu(system.tocsc()).solve(right).reshape(3, n).T
     return t, p
 

@@ -228,6 +228,27 @@ def test_a_log_shows_an_offset_by_where_its_streams_begin_and_end():
     assert judged(late, tdoa, arrivals=False).keys() == {"imu_partly"}
 
 
+@pytest.mark.parametrize("blinks", [0.5, 3.0])
+def test_blinks_have_one_stamp_and_slow_stamps_are_no_milliseconds(blinks):
+    """All anchors beside the first one; the same with pairs in a ring are packets of samples."""
+    imu, (t, arrival, a, b, d) = streams(tdoa_rate=7.0 * blinks, seconds=60.0)
+    blink = np.floor(np.arange(len(t)) / 7.0) / blinks
+    ids = np.tile(ANCHORS.ids[1:], len(t) // 7 + 1)[: len(t)]
+    of_blinks = 100.0 + blink, 100.01 + blink, np.full(len(t), ANCHORS.ids[0]), ids, d
+    assert not {"stamps_coarse", "stamps_unit"} & judged(imu, of_blinks).keys()
+    assert "stamps_coarse" in judged(imu, (*of_blinks[:2], a, b, d))
+    again = np.tile(ids[:3], len(t))[: len(t)]  # and a pair comes twice with one stamp
+    assert "stamps_coarse" in judged(imu, (*of_blinks[:3], again, d))
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+def test_a_tag_of_few_tdoas_is_slow_and_in_seconds(rate):
+    imu, tdoa = streams(tdoa_rate=rate, seconds=60.0)
+    found = judged(imu, tdoa)
+    assert "rate" in found and "stamps_unit" not in found
+    assert "stamps_unit" in judged(imu, put(tdoa, T, 1e3 * tdoa[T]), arrivals=False)
+
+
 def test_both_streams_on_another_clock_than_the_recorder_is_a_note():
     imu, tdoa = streams()
     found = judged(put(imu, ARRIVAL, imu[ARRIVAL] + 1e6), put(tdoa, ARRIVAL, tdoa[ARRIVAL] + 1e6))

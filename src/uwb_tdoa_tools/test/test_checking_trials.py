@@ -403,7 +403,7 @@ def test_errors_that_depend_on_the_place_blame_no_anchor():
     p = np.stack([np.interp(sound.tdoa.t, truth.t, column) for column in truth.p.T], axis=1)
     slopes = 0.4 * np.random.default_rng(5).standard_normal((len(sound.anchors), 3))
     wrong = with_errors(sound, (p - p.mean(axis=0)) @ slopes.T)
-    found = _misfit(wrong.survey_fit)
+    found = _misfit(wrong)
     assert found is not None and found.rule == "radio_errors"
     assert not list(tdoa_rules.moved_anchor(wrong))
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
-from uwb_tdoa_bias.common.robust_loss import CAUCHY, HUBER, weight
+from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from . import hypotheses
 from .initialization import last_few, recent
@@ -44,7 +44,8 @@ ALONE = 5.0  # s without another sensor after which a tag counts as alone
 QUIET = 1.0  # s after which a quiet tag does: its inertial sensor does not show where it is
 # passes over the window with a new TDOA, at the begin, and over a recording
 PASSES, FIRST, ALL = (2, 10, 15)
-BEND = 4.0  # standard deviations at which the losses bend
+# standard deviations at which the loss of each model bends: a fast tag also moves by much
+BENDS = np.array([12.0, 12.0, 12.0, 8.0, 8.0, 6.0, 6.0, 6.0, 6.0])
 LARGEST_NIS = 9.0  # normalized innovation squared; limits the effect of an outlier on the choice
 # Noise of a model: number of TDOAs for which tdoa_std counts, share of a new value, largest
 # normalized innovation squared, least standard deviation in m.
@@ -98,10 +99,10 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
         for _ in range(passes):
             _forward(model, window, anchors, motion, bounds, at, steps)
             _backward(steps, at, no_rows)
-            _weigh(model.std, window, anchors, at)
+            _weigh(BENDS[m] * model.std, window, anchors, at)
             # an outlier moves the end of the path, so the residual to the path does not show it
-            last, scale = steps[n - 1], BEND * math.sqrt(steps[n - 1].unweighted)
-            by_innovation = weight(CAUCHY, last.tdoa.innovation, scale)
+            last, scale = steps[n - 1], BENDS[m] * math.sqrt(steps[n - 1].unweighted)
+            by_innovation = weight(GEMAN_MCCLURE, last.tdoa.innovation, scale)
             at[n - 1].weight = min(at[n - 1].weight, by_innovation)
         scores[m], fit = _judge(window, steps)
         _learn_noise(model, n, fit, parameters.tdoa_std)
@@ -387,13 +388,13 @@ def through_update(
 
 
 @compiled
-def _weigh(std: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) -> None:
-    """Set the robust weight of each TDOA by its residual to the path; std is its noise, m."""
+def _weigh(scale: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) -> None:
+    """Set the robust weight of each TDOA by its residual to the path; the loss bends at scale, m."""
     row = np.empty(3)
     for i in range(len(window)):
         a, b = anchors[window[i].a].position, anchors[window[i].b].position
         off = window[i].d - linearized_tdoa(at[i].p, a, b, row)
-        at[i].weight = weight(HUBER, off, BEND * std)
+        at[i].weight = weight(GEMAN_MCCLURE, off, scale)
 
 
 @compiled
@@ -478,7 +479,7 @@ def smooth(
         for _ in range(ALL):
             _forward(model, tdoas, anchors, motion, bounds, at, steps)
             losses[m], fit = _backward(steps, at, rows[m])
-            _weigh(model.std, tdoas, anchors, at)
+            _weigh(BENDS[m % MODELS] * model.std, tdoas, anchors, at)
             _learn_noise(model, n, fit, prior)
     weights = np.exp(np.min(losses) - losses)
     weights /= np.sum(weights)

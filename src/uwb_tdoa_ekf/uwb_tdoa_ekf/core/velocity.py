@@ -332,26 +332,31 @@ def _repeats(state: Record, sensor: Record) -> bool:
 
 @compiled
 def _worst(ekf: Record, sensor: Record, residual: Record) -> float:
-    """Return the largest normalized innovation squared of the components, for the best hypothesis.
+    """Return the largest normalized innovation squared of the components, least of all hypotheses.
 
-    The residual is filled with this component.
+    A velocity that fits one hypothesis decides between them. The residual is filled with its component.
     """
-    innovation, worst = ekf.innovation, -1.0
-    for axis in range(3):
-        if sensor.std[axis] <= LONGEST_STD:
-            compare(
-                ekf.hypotheses[ekf.best],
-                sensor.value[axis],
-                sensor.std[axis],
-                axis,
-                ekf.transition.rotation,
-                innovation,
-            )
-            total = innovation.prior_variance + innovation.noise_variance
-            nis = innovation.value**2 / total
-            if nis > worst:
-                worst, residual.innovation, residual.variance = nis, innovation.value, total
-    return worst
+    innovation, least = ekf.innovation, np.inf
+    for h in range(len(ekf.hypotheses)):
+        if not alive(ekf.hypotheses[h]):
+            continue
+        worst, value, variance = -1.0, 0.0, 0.0
+        for axis in range(3):
+            if sensor.std[axis] <= LONGEST_STD:
+                compare(
+                    ekf.hypotheses[h],
+                    sensor.value[axis],
+                    sensor.std[axis],
+                    axis,
+                    ekf.transition.rotation,
+                    innovation,
+                )
+                total = innovation.prior_variance + innovation.noise_variance
+                if innovation.value**2 / total > worst:
+                    worst, value, variance = innovation.value**2 / total, innovation.value, total
+        if worst < least:
+            least, residual.innovation, residual.variance = worst, value, variance
+    return least
 
 
 @compiled

@@ -22,6 +22,7 @@ STAMP_LINE = (
     "nanoseconds"
 )
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
+ANOTHER_UNIT = 25.0  # times the longest usual step: 1.25 s between TDOAs, as of milliseconds
 # s between stamps; healthy 0.012 and 0.116 at most
 LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}
 UNSTAMPED, STANDING = 0.01, 0.98  # shares of stamps that are 0, and that equal the one before
@@ -222,7 +223,7 @@ def rate(name: str, windows: list[StampWindow]) -> Iterator[Finding]:
     if not step > slowest:
         return
     scale = next((scale for scale in UNITS if 1e-5 < step / scale < slowest), 0.0)
-    if scale and step > 0.5:
+    if scale and step > ANOTHER_UNIT * slowest:
         yield Finding(
             "stamps_unit",
             ERROR,

@@ -427,11 +427,22 @@ def tdoa_window(columns: list[np.ndarray], own: int, positions: np.ndarray) -> T
     at_ceiling = mine[size == ceiling]
     hits = len(at_ceiling) if len(np.unique(either[at_ceiling])) > 1 else 0
 
+    # the TDOAs of one blink share a stamp and an anchor, and each is of another pair
+    again = np.zeros(len(t), bool)
+    again[order[1:]] = (pair[order[1:]] == pair[order[:-1]]) & (t[order[1:]] == t[order[:-1]])
+    with_last = (np.diff(t, prepend=np.nan) == 0.0) & (
+        (np.diff(a, prepend=-1) == 0) | (np.diff(b, prepend=-1) == 0)
+    )
+    first = np.flatnonzero(again | ~with_last)
+    of_blinks = stamp_window(t[first], arrival[first], np.count_nonzero(first < own))
+
     latest = order[np.flatnonzero(np.diff(pair[order], append=-1))]
     newest = t[np.isfinite(t)][-1:]
     latest = latest[(np.abs(t[latest, None] - newest) < FRESH).any(axis=1)]
     return TdoaWindow(
-        stamps=stamp_window(t, arrival, own),
+        stamps=stamp_window(t, arrival, own)._replace(
+            same=of_blinks.same, scatter=of_blinks.scatter
+        ),
         known=len(mine),
         unknown=int(unknown[own:].sum()),
         of_one=int(of_one[own:].sum()),

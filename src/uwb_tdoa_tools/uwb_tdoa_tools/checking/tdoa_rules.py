@@ -96,12 +96,13 @@ def other_unit(recording: OrderedRecording) -> tuple[Finding, OrderedRecording] 
     The noise of the radio is known, and a motion must explain most of the TDOAs.
     """
     noise = successive_difference(recording.tdoa)
-    if not noise > 0.0 or (in_metres(recording) and _is_explained(recording)):
+    # small TDOAs are explained wherever they come from, large ones only in metres
+    if not noise > 0.0 or (noise >= NOISE[0] and is_explained(recording)):
         return None
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
     trial = recording.with_tdoa(d=recording.tdoa.d * scale)
-    if not NOISE[0] <= scale * noise <= NOISE[1] or not _is_explained(trial):
+    if not NOISE[0] <= scale * noise <= NOISE[1] or not is_explained(trial):
         return None
     found = Finding(
         "tdoa_unit",
@@ -118,9 +119,9 @@ def other_unit(recording: OrderedRecording) -> tuple[Finding, OrderedRecording] 
     return found, trial
 
 
-def _is_explained(recording: OrderedRecording) -> bool:
-    """Return whether a motion explains most of the TDOAs."""
-    return recording.part(LONG).unexplained(WELL).mean < WELL
+def is_explained(recording: OrderedRecording, most: float = WELL) -> bool:
+    """Return whether a motion explains the TDOAs but for a loss of `most`, also a fast motion."""
+    return recording.part(LONG).unexplained(most).mean < most
 
 
 def successive_difference(tdoa: Tdoas) -> float:
