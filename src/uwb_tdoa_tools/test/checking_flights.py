@@ -20,6 +20,7 @@ QUICK = dict(
     speed=1.2,
     floor_time=2.0,
 )
+RATE = 200.0  # TDOAs a second: half of what a tag hears, and trials take half of the time
 
 
 @cache
@@ -27,3 +28,8 @@ def recording(seed=0, live=False, **config):
     """Return the Recording of a simulated flight."""
     made = of_flight(simulate(SimulationConfig(seed=seed, **{**QUICK, **config})))
     return arriving(made, seed) if live else made
+
+
+def sparse_recording(seed=0, **config):
+    """Return the Recording of a simulated flight with RATE TDOAs a second."""
+    return recording(seed, **{"tdoa_rate": RATE, **config})

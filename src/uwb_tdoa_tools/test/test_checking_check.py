@@ -9,7 +9,7 @@ from dataclasses import replace
 from itertools import product
 
 import checking_flights
-from checking_flights import QUICK
+from checking_flights import QUICK, sparse_recording as recording
 from known_effects import clean_flight
 from mistakes import MISTAKES
 import numpy as np
@@ -46,13 +46,7 @@ NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 TRIED = """sign order pair swapped from_one another_room another_room_alone typing_error mirrored_survey
     upside_down_survey y_up_survey minus_gravity gyro_sign left_handed gyro_exchanged""".split()
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # visible once the yaw is known
-RATE = 200.0  # TDOAs a second: half of what a tag hears, and trials take half of the time
 HARMLESS = "clipped_accel"  # a smooth simulated flight does not reach the limits
-
-
-def recording(seed=0, **settings):
-    """Return the Recording of a simulated flight with RATE TDOAs a second."""
-    return checking_flights.recording(seed, tdoa_rate=RATE, **settings)
 
 
 def rules(findings):
