@@ -47,8 +47,6 @@ from uwb_tdoa_tools.surveying.report import (
 
 # --- surveying ---
 
-# --- surveying ---
-
 LATE = EFFECTS["anchor_delay"]({"3": 0.15})
 TRUSTED = ("0", "6", "1.z", "2.z")
 
@@ -734,7 +732,7 @@ def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alo
     ],
 )
 def test_one_late_anchor_is_no_moved_one(effect, change):
-    flights = [flight_with(effect, seed=seed, make=all_tdoas) for seed in (100, 101)]
+    flights = [flight_with(effect, seed=seed) for seed in (100, 101)]
     found = self_calibrate(flights, Tape(std=0.03))
     assert found.why_not is None and len(found.changes) == 1
     assert re.match(change, found.changes[0].as_text())
