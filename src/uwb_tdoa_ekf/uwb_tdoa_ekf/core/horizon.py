@@ -25,7 +25,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
-from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
+from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, HUBER, weight
 
 from . import hypotheses
 from .initialization import last_few, recent
@@ -42,10 +42,11 @@ MEMORY = 5.0  # s of TDOAs that decide between the models
 BEGINS, ENDS = (30, 45)
 ALONE = 5.0  # s without another sensor after which a tag counts as alone
 QUIET = 1.0  # s after which a quiet tag does: its inertial sensor does not show where it is
-# passes over the window with a new TDOA, at the begin, and over a recording
-PASSES, FIRST, ALL = (2, 10, 15)
+# passes over the window with a new TDOA, at the begin, over a recording, and last ones over it
+PASSES, FIRST, ALL, LAST = (2, 10, 15, 5)
 # standard deviations at which the loss of each model bends: a fast tag also moves by much
 BENDS = np.array([12.0, 12.0, 12.0, 8.0, 8.0, 6.0, 6.0, 6.0, 6.0])
+NEAR = 4.0  # the same of a convex loss, with which a path over a recording finds its side of the anchors
 LARGEST_NIS = 9.0  # normalized innovation squared; limits the effect of an outlier on the choice
 # Noise of a model: number of TDOAs for which tdoa_std counts, share of a new value, largest
 # normalized innovation squared, least standard deviation in m.
@@ -99,7 +100,7 @@ def step(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None
         for _ in range(passes):
             _forward(model, window, anchors, motion, bounds, at, steps)
             _backward(steps, at, no_rows)
-            _weigh(BENDS[m] * model.std, window, anchors, at)
+            _weigh(GEMAN_MCCLURE, BENDS[m] * model.std, window, anchors, at)
             # an outlier moves the end of the path, so the residual to the path does not show it
             last, scale = steps[n - 1], BENDS[m] * math.sqrt(steps[n - 1].unweighted)
             by_innovation = weight(GEMAN_MCCLURE, last.tdoa.innovation, scale)
@@ -388,13 +389,15 @@ def through_update(
 
 
 @compiled
-def _weigh(scale: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray) -> None:
+def _weigh(
+    loss: int, scale: float, window: np.ndarray, anchors: np.ndarray, at: np.ndarray
+) -> None:
     """Set the robust weight of each TDOA by its residual to the path; the loss bends at scale, m."""
     row = np.empty(3)
     for i in range(len(window)):
         a, b = anchors[window[i].a].position, anchors[window[i].b].position
         off = window[i].d - linearized_tdoa(at[i].p, a, b, row)
-        at[i].weight = weight(GEMAN_MCCLURE, off, scale)
+        at[i].weight = weight(loss, off, scale)
 
 
 @compiled
@@ -476,10 +479,15 @@ def smooth(
         anywhere(bounds, model.x, model.P)
         for i in range(n):
             at[i].weight, at[i].p[:] = 1.0, begins[m // MODELS, i]
-        for _ in range(ALL):
+        for sweep in range(1, ALL + LAST + 1):
             _forward(model, tdoas, anchors, motion, bounds, at, steps)
-            losses[m], fit = _backward(steps, at, rows[m])
-            _weigh(BENDS[m % MODELS] * model.std, tdoas, anchors, at)
+            loss, fit = _backward(steps, at, rows[m])
+            if sweep == ALL:
+                losses[m] = loss
+            if sweep < ALL:
+                _weigh(HUBER, NEAR * model.std, tdoas, anchors, at)
+            else:
+                _weigh(GEMAN_MCCLURE, BENDS[m % MODELS] * model.std, tdoas, anchors, at)
             _learn_noise(model, n, fit, prior)
     weights = np.exp(np.min(losses) - losses)
     weights /= np.sum(weights)

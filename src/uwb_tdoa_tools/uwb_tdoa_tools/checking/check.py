@@ -64,7 +64,7 @@ NOTHING_TO_TRY = {
     "anchor_scale",
 }
 # loss below which one motion explains TDOAs that leap and return: simulated tags with 10 % outliers 0.11 to
-# 0.27, two measured flights on one topic 0.22 at least but for 2 of 131
+# 0.27, two measured flights on one topic 0.2 at least but for one of 131
 ONE_TAG = 0.2
 WITHOUT_IMU = {
     "imu_silent",
