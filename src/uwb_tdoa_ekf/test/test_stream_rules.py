@@ -230,7 +230,7 @@ def test_a_log_shows_an_offset_by_where_its_streams_begin_and_end():
 
 @pytest.mark.parametrize("blinks", [0.5, 3.0])
 def test_blinks_have_one_stamp_and_slow_stamps_are_no_milliseconds(blinks):
-    """All anchors beside the first one; the same with pairs in a ring are packets of samples."""
+    """All TDOAs of a blink are with the first anchor. Of pairs in a ring, they would be a packet."""
     imu, (t, arrival, a, b, d) = streams(tdoa_rate=7.0 * blinks, seconds=60.0)
     blink = np.floor(np.arange(len(t)) / 7.0) / blinks
     ids = np.tile(ANCHORS.ids[1:], len(t) // 7 + 1)[: len(t)]

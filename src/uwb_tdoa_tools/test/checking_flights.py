@@ -20,7 +20,7 @@ QUICK = dict(
     speed=1.2,
     floor_time=2.0,
 )
-RATE = 200.0  # TDOAs a second: half of what a tag hears, and trials take half of the time
+RATE = 200.0  # TDOAs a second. A tag hears twice as many, and trials would take twice as long.
 
 
 @cache

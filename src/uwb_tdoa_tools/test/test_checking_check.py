@@ -299,7 +299,7 @@ def errors(recording):
 
 
 def test_outliers_are_no_second_tag():
-    """6 % of few TDOAs leap and return as those of two tags do, and one motion explains the others."""
+    """6 % leap and return, as TDOAs of two tags do. One motion explains all others."""
     sound = checking_flights.recording(3, tdoa_rate=28.0, duration=60.0, protocol="tdoa2")
     wrong = disturbed(sound, share=0.06)
     assert "two_tags" in rules(processed_streams(wrong).findings())
